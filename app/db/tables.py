@@ -1,0 +1,189 @@
+"""The tables: organisation, key, building, floor, survey, map, job; and worker and idempotency beside them.
+
+Ids are UUIDv7 strings, so they sort by creation. Times are UTC. Every row that a key may reach carries its
+organisation. `migrations/` holds the same schema as history; a test compares the two.
+"""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import JSON, DateTime, Dialect, ForeignKey, Index, MetaData, String, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy.types import TypeDecorator
+from uuid6 import uuid7
+
+__all__ = ["Base", "Building", "Floor", "Idempotency", "Job", "Key", "Map", "Organisation", "Survey", "Worker", "new_id"]
+
+
+def new_id() -> str:
+    """A new UUIDv7: opaque to callers, sortable by time."""
+    return str(uuid7())
+
+
+def utc_now() -> datetime:
+    return datetime.now(UTC)
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """Aware UTC datetimes, also on SQLite, which forgets zones."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        return None if value is None else value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        return None if value is None else (value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC))
+
+
+class Base(DeclarativeBase):
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+    type_annotation_map = {datetime: UtcDateTime, dict[str, Any]: JSON, list[str]: JSON, list[float]: JSON}  # noqa: RUF012
+
+
+Id = String(36)
+Sha256 = String(64)
+
+
+class Organisation(Base):
+    __tablename__ = "organisation"
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    name: Mapped[str] = mapped_column(String(200), unique=True)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Key(Base):
+    """An API key. Only its SHA-256 is kept: the key itself is shown once."""
+
+    __tablename__ = "key"
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"), index=True)
+    name: Mapped[str] = mapped_column(String(200))
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    scopes: Mapped[list[str]]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    revoked_at: Mapped[datetime | None]
+
+
+class Building(Base):
+    __tablename__ = "building"
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"), index=True)
+    name: Mapped[str] = mapped_column(String(200))
+    anchor: Mapped[dict[str, Any] | None]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Floor(Base):
+    """`claimed_generation` names rebuilds (docs/decisions/0003); `build_sequence` orders builds as they start;
+    `active_sequence` is the sequence of the build that `active_map_id` points to, so an older build never replaces a
+    newer one."""
+
+    __tablename__ = "floor"
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    building_id: Mapped[str] = mapped_column(ForeignKey("building.id"), index=True)
+    name: Mapped[str] = mapped_column(String(200))
+    ordinal: Mapped[int]
+    elevation_m: Mapped[float]
+    height_m: Mapped[float | None]
+    outline: Mapped[dict[str, Any] | None]
+    auto_build: Mapped[bool] = mapped_column(default=True)
+    claimed_generation: Mapped[int] = mapped_column(default=0)
+    build_sequence: Mapped[int] = mapped_column(default=0)
+    active_map_id: Mapped[str | None] = mapped_column(Id)
+    active_sequence: Mapped[int] = mapped_column(default=0)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Survey(Base):
+    __tablename__ = "survey"
+    __table_args__ = (UniqueConstraint("floor_id", "raw_sha256", "format", "frame"),)
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    floor_id: Mapped[str] = mapped_column(ForeignKey("floor.id"), index=True)
+    name: Mapped[str] = mapped_column(String(200))
+    format: Mapped[str] = mapped_column(String(40))
+    frame: Mapped[str] = mapped_column(String(20))
+    raw_sha256: Mapped[str] = mapped_column(Sha256)
+    samples_sha256: Mapped[str] = mapped_column(Sha256)
+    sample_count: Mapped[int]
+    report: Mapped[dict[str, Any]]
+    included: Mapped[bool] = mapped_column(default=True)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Map(Base):
+    """`status`: accepted, running, ready, failed, dismissed. `spec` is the request; the grid is a blob."""
+
+    __tablename__ = "map"
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    floor_id: Mapped[str] = mapped_column(ForeignKey("floor.id"), index=True)
+    status: Mapped[str] = mapped_column(String(20))
+    sequence: Mapped[int] = mapped_column(default=0)
+    activate: Mapped[bool] = mapped_column(default=True)
+    spec: Mapped[dict[str, Any]]
+    survey_ids: Mapped[list[str]]
+    components: Mapped[str | None] = mapped_column(String(20))
+    grid_sha256: Mapped[str | None] = mapped_column(Sha256)
+    quality_sha256: Mapped[str | None] = mapped_column(Sha256)
+    bounds_m: Mapped[list[float] | None]
+    hyperparameters: Mapped[dict[str, Any] | None]
+    score: Mapped[dict[str, Any] | None]
+    score_reason: Mapped[str | None]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    finished_at: Mapped[datetime | None]
+
+
+class Job(Base):
+    """What a user sees of background work. `workflow_id` names it in the engine: one row per workflow.
+
+    `status`: accepted, running, successful, failed, dismissed (OGC API Processes)."""
+
+    __tablename__ = "job"
+    __table_args__ = (Index("ix_job_organisation_id_id", "organisation_id", "id"),)
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    floor_id: Mapped[str] = mapped_column(Id)
+    map_id: Mapped[str | None] = mapped_column(Id)
+    kind: Mapped[str] = mapped_column(String(40))
+    workflow_id: Mapped[str] = mapped_column(String(120), unique=True)
+    status: Mapped[str] = mapped_column(String(20), default="accepted")
+    progress: Mapped[int] = mapped_column(default=0)
+    message: Mapped[str] = mapped_column(default="waiting for a worker")
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+    result: Mapped[dict[str, Any] | None]
+
+
+class Worker(Base):
+    """The lease of a worker process (docs/decisions/0003): `beat` is the database's clock, `state` live or dead."""
+
+    __tablename__ = "worker"
+    id: Mapped[str] = mapped_column(String(120), primary_key=True)
+    state: Mapped[str] = mapped_column(String(10))
+    beat: Mapped[datetime]
+    reaper: Mapped[str | None] = mapped_column(String(120))
+
+
+class Idempotency(Base):
+    """The answer once given to a request with an Idempotency-Key, to be given again."""
+
+    __tablename__ = "idempotency"
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"), primary_key=True)
+    key: Mapped[str] = mapped_column(String(200), primary_key=True)
+    fingerprint: Mapped[str] = mapped_column(Sha256)
+    status_code: Mapped[int]
+    body: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)

@@ -1,0 +1,83 @@
+"""Every error Isodyn raises on purpose, drawn as one tree.
+
+* IsodynError
+    * InvalidInput              what the caller sent cannot be used; says where and why     (HTTP 422)
+        * UnreadableSurvey      a survey file that cannot be read: line, column, reason
+        * InvalidWindow         a window of samples that cannot be matched
+        * IncompatibleFrames    a map cannot answer this frame or these components
+    * NotFound                  no such object, or it belongs to somebody else              (HTTP 404)
+    * Conflict                  the object's present state forbids it                       (HTTP 409)
+    * TooLarge                  more bytes or samples than the limit                        (HTTP 413)
+    * JobCancelled              a job was asked to stop, and did
+    * CorruptArtefact           stored bytes do not match their hash or their format
+
+`app.api.problems` gives each its RFC 9457 document; nothing below the API knows about HTTP.
+"""
+
+from dataclasses import dataclass
+
+__all__ = [
+    "Conflict",
+    "CorruptArtefact",
+    "Fault",
+    "IncompatibleFrames",
+    "InvalidInput",
+    "InvalidWindow",
+    "IsodynError",
+    "JobCancelled",
+    "NotFound",
+    "TooLarge",
+    "UnreadableSurvey",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that is wrong: `location` says where (a JSON pointer, or `line 7, column bx_ut`), `reason` says why."""
+
+    location: str
+    reason: str
+
+
+class IsodynError(Exception):
+    """The root: `str(error)` is a sentence for a person that says what to do next."""
+
+    def __init__(self, message: str, *faults: Fault) -> None:
+        super().__init__(message)
+        self.faults = faults
+
+
+class InvalidInput(IsodynError):
+    """What the caller sent cannot be used."""
+
+
+class UnreadableSurvey(InvalidInput):
+    """A survey file that cannot be read."""
+
+
+class InvalidWindow(InvalidInput):
+    """A window of samples that cannot be matched."""
+
+
+class IncompatibleFrames(InvalidInput):
+    """A map cannot answer this frame or these components."""
+
+
+class NotFound(IsodynError):
+    """No such object, or it belongs to somebody else."""
+
+
+class Conflict(IsodynError):
+    """The object's present state forbids it."""
+
+
+class TooLarge(IsodynError):
+    """More bytes or samples than the limit."""
+
+
+class JobCancelled(IsodynError):
+    """A job was asked to stop, and did."""
+
+
+class CorruptArtefact(IsodynError):
+    """Stored bytes do not match their hash or their format."""

@@ -1,0 +1,98 @@
+"""A fix: what is believed after a window was matched against the maps of some floors."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from app.geometry import Array
+
+__all__ = ["AblEstimate", "Fix", "LocateOptions", "MlEstimate", "MlrEstimate", "Mode", "Posterior", "Prior", "Status"]
+
+Status = Literal["fix", "ambiguous", "inconsistent", "unmapped"]
+
+
+@dataclass(frozen=True, slots=True)
+class LocateOptions:
+    """Parameters of the techniques (Shockley 8.2, 8.3) and of the gate."""
+
+    mlr_ratio: float = 2.0
+    mlr_min_distance_m: float = 5.0
+    abl_threshold: float | None = None     # None: the default of techniques.py, as a multiple of the uniform mass
+    abl_bin_m: float = 2.0
+    gate_probability: float = 0.997        # chi-square gate on the best pose (Shockley 8.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Where the device is thought to be now (last sample), before the window is looked at."""
+
+    position_m: tuple[float, float, float]
+    sd_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class MlEstimate:
+    """Maximum likelihood (Shockley 8.1): always answers if any pose was searched."""
+
+    floor_id: str
+    position_m: tuple[float, float, float]
+    heading_rad: float | None
+    log_likelihood: float
+
+
+@dataclass(frozen=True, slots=True)
+class MlrEstimate:
+    """Maximum likelihood ratio (Shockley 8.2). `available` False: position is None and `reason` says why."""
+
+    available: bool
+    ratio: float | None
+    floor_id: str | None = None
+    position_m: tuple[float, float, float] | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AblEstimate:
+    """Aggregate bin likelihood (Shockley 8.3), bins in the plane."""
+
+    available: bool
+    bin_probability: float | None = None
+    floor_id: str | None = None
+    position_m: tuple[float, float, float] | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One place the device may be."""
+
+    floor_id: str
+    position_m: tuple[float, float, float]
+    heading_rad: float | None
+    probability: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """The belief. `radius_*_m` are horizontal radii about `position_m` holding 68 and 95 % of the mass on that floor,
+    position and covariance those of the strongest floor."""
+
+    floor_probability: dict[str, float]
+    floor_id: str
+    position_m: tuple[float, float, float]
+    covariance_m2: Array                   # (2, 2)
+    radius_68_m: float
+    radius_95_m: float
+    modes: tuple[Mode, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """The answer to a window. `ml` and `posterior` are None only when no floor had a map to search."""
+
+    status: Status
+    reason: str | None                     # for every status but "fix": what is wrong and what would help
+    ml: MlEstimate | None
+    mlr: MlrEstimate
+    abl: AblEstimate
+    posterior: Posterior | None
+    search_ms: float

@@ -1,0 +1,34 @@
+"""Settings, read once at the edge from `ISODYN_*` and passed on as values."""
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+__all__ = ["Settings"]
+
+
+class Settings(BaseSettings):
+    """Every environment variable Isodyn reads."""
+
+    model_config = SettingsConfigDict(env_prefix="ISODYN_", extra="ignore")
+
+    data_dir: Path = Field(Path("./var"), description="folder of the database and the blobs")
+    database_url: str | None = Field(None, description="default: SQLite in the data folder; or postgresql+psycopg://")
+    blob_url: str | None = Field(None, description="default: a folder in the data folder; a file:// address")
+    admin_key: str | None = Field(None, description="the admin key; else one is made at first start and printed once")
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port: int = Field(8300, ge=0, le=65535, description="port to listen on; 0 picks a free one")
+    max_upload_bytes: int = Field(64 * 2**20, description="largest survey body, before and after decompression")
+    max_body_bytes: int = Field(4 * 2**20, description="largest JSON body")
+    max_window_samples: int = Field(2000, description="most samples in one window")
+    grid_cache_bytes: int = Field(512 * 2**20, description="memory for maps held ready to answer")
+    worker_processes: int = Field(1, ge=1, description="child processes fitting maps at one time, per worker")
+
+    @property
+    def resolved_database_url(self) -> str:
+        return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'isodyn.db'}"
+
+    @property
+    def resolved_blob_url(self) -> str:
+        return self.blob_url or f"file://{self.data_dir.resolve() / 'blobs'}"
