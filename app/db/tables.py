@@ -12,7 +12,19 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.types import TypeDecorator
 from uuid6 import uuid7
 
-__all__ = ["Base", "Building", "Floor", "Idempotency", "Job", "Key", "Map", "Organisation", "Survey", "Worker", "new_id"]
+__all__ = [
+    "Base",
+    "Building",
+    "Floor",
+    "Idempotency",
+    "Job",
+    "Key",
+    "Map",
+    "Organisation",
+    "Survey",
+    "Worker",
+    "new_id",
+]
 
 
 def new_id() -> str:

@@ -1,0 +1,161 @@
+"""The database: SQLite in a file by default, PostgreSQL by URL, the same code on both.
+
+SQLite: every write transaction begins IMMEDIATE, so it never fails half-way because somebody else wrote in between;
+a plain SELECT takes no transaction and waits for nobody (WAL). Reads therefore behave as PostgreSQL's READ COMMITTED.
+"""
+
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.engine import URL
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.errors import InvalidInput
+
+__all__ = ["create_database_engine", "downgrade", "migrate", "session_factory"]
+
+BUSY_TIMEOUT_S = 30.0
+MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
+
+
+def create_database_engine(url: str) -> Engine:
+    """An engine for `sqlite:///file` or `postgresql+psycopg://`. Raises InvalidInput for any other address."""
+    parsed = _checked(url)
+    if parsed.get_backend_name() == "postgresql":
+        return create_engine(parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800)
+    engine = create_engine(
+        parsed,
+        pool_size=10,
+        max_overflow=30,
+        connect_args={"timeout": BUSY_TIMEOUT_S, "isolation_level": "IMMEDIATE", "check_same_thread": False},
+    )
+    event.listen(engine, "connect", _prepare_sqlite_connection)
+    event.listen(engine, "savepoint", _begin_before_savepoint)
+    return engine
+
+
+def session_factory(engine: Engine) -> sessionmaker[Session]:
+    """Sessions whose objects stay readable after commit."""
+    return sessionmaker(engine, expire_on_commit=False)
+
+
+def migrate(database: Engine | str) -> None:
+    """Bring the schema, ours and the job engine's, to this version.
+
+    Several processes may call this at once: one migrates, the others wait and find it done.
+    """
+    with _engine_of(database) as engine:
+        _prepare_sqlite_file(engine)
+        with _migration_lock(engine):
+            _run_alembic(engine, "upgrade", "head")
+            _migrate_job_engine(engine.url)
+
+
+def downgrade(database: Engine | str, revision: str = "base") -> None:
+    """Take our schema back to `revision`; the job engine's own tables stay."""
+    with _engine_of(database) as engine, _migration_lock(engine):
+        _run_alembic(engine, "downgrade", revision)
+
+
+def _checked(url: str) -> URL:
+    parsed = make_url(url)
+    if parsed.get_backend_name() == "postgresql":
+        return parsed.set(drivername="postgresql+psycopg")
+    if parsed.get_backend_name() != "sqlite":
+        raise InvalidInput(
+            f"database address {parsed.render_as_string()!r}: {parsed.get_backend_name()} is not offered; "
+            "use sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
+        )
+    if parsed.database in (None, "", ":memory:"):
+        raise InvalidInput("database address 'sqlite://': the worker is another process and needs a file; name one")
+    return parsed
+
+
+@contextmanager
+def _engine_of(database: Engine | str) -> Iterator[Engine]:
+    if isinstance(database, Engine):
+        yield database
+        return
+    engine = create_database_engine(database)
+    try:
+        yield engine
+    finally:
+        engine.dispose()
+
+
+def _prepare_sqlite_connection(connection: sqlite3.Connection, _record: object) -> None:
+    # FULL: an acknowledged commit survives a power cut, also in WAL.
+    for pragma in ("foreign_keys = ON", f"busy_timeout = {int(BUSY_TIMEOUT_S * 1000)}", "synchronous = FULL"):
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def _begin_before_savepoint(connection: Connection, _name: str) -> None:
+    # sqlite3 begins before INSERT, UPDATE and DELETE only: a savepoint set first would be a transaction of its own,
+    # and releasing it would commit.
+    driver = connection.connection.driver_connection
+    if isinstance(driver, sqlite3.Connection) and not driver.in_transaction:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def _prepare_sqlite_file(engine: Engine) -> None:
+    """Make the folder, and set write-ahead logging once: it persists in the file."""
+    if engine.dialect.name != "sqlite":
+        return
+    Path(str(engine.url.database)).parent.mkdir(parents=True, exist_ok=True)
+    deadline = time.monotonic() + BUSY_TIMEOUT_S
+    while True:
+        try:
+            with engine.connect() as connection:
+                connection.exec_driver_sql("PRAGMA journal_mode = WAL")
+            return
+        except OperationalError:  # the switch itself does not wait for other processes
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+
+
+@contextmanager
+def _migration_lock(engine: Engine) -> Iterator[None]:
+    """PostgreSQL: one migration at a time. SQLite: the write transaction of each step is lock enough."""
+    if engine.dialect.name == "sqlite":
+        yield
+        return
+    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        # Polled, and in no transaction: the job engine builds indexes CONCURRENTLY, which waits for every open
+        # snapshot, also that of a process blocked inside pg_advisory_lock.
+        while not connection.scalar(text("SELECT pg_try_advisory_lock(:n)"), {"n": MIGRATION_LOCK}):
+            time.sleep(0.1)
+        try:
+            yield
+        finally:
+            connection.execute(text("SELECT pg_advisory_unlock(:n)"), {"n": MIGRATION_LOCK})
+
+
+def _run_alembic(engine: Engine, verb: str, revision: str) -> None:
+    from alembic import command
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(resources.files("migrations")).replace("%", "%%"))
+    run: Any = getattr(command, verb)
+    with engine.connect() as connection:
+        if engine.dialect.name == "sqlite":
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        else:
+            connection.begin()
+        config.attributes["connection"] = connection
+        run(config, revision)
+        connection.commit()
+
+
+def _migrate_job_engine(url: URL) -> None:
+    from dbos import DBOS
+
+    DBOS.migrate(url.render_as_string(hide_password=False))

@@ -1,0 +1,112 @@
+"""The schema by migration is the schema of the tables, up and down, on both databases."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import Connection, Engine, inspect, select, text
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.db.engine import create_database_engine, downgrade, migrate
+from app.db.tables import Base, Organisation
+from app.errors import InvalidInput
+
+ROOT = Path(__file__).parents[2]
+OURS = set(Base.metadata.tables) | {"alembic_version"}
+
+
+def differences(connection: Connection) -> list[object]:
+    def ours(_item: object, name: str | None, kind: str, reflected: bool, _other: object) -> bool:
+        return not (kind == "table" and reflected and name not in OURS)
+
+    options = {"include_object": ours, "compare_type": True, "compare_server_default": True}
+    return compare_metadata(MigrationContext.configure(connection, opts=options), Base.metadata)
+
+
+def test_migrated_schema_is_that_of_the_tables(engine: Engine) -> None:
+    with engine.connect() as connection:
+        assert differences(connection) == []
+
+
+def test_no_table_but_ours_and_the_job_engines(engine: Engine) -> None:
+    ours = {name for name in inspect(engine).get_table_names() if "workflow" not in name}
+    assert ours >= OURS
+    if engine.dialect.name == "postgresql":  # there the job engine has a schema of its own
+        assert ours == OURS
+        assert "workflow_status" in inspect(engine).get_table_names(schema="dbos")
+
+
+def test_down_and_up_again(engine: Engine, database_url: str) -> None:
+    downgrade(database_url)
+    assert not (set(inspect(engine).get_table_names()) & OURS - {"alembic_version"})
+    migrate(database_url)
+    migrate(engine)  # once more changes nothing
+    with engine.connect() as connection:
+        assert differences(connection) == []
+
+
+@pytest.fixture
+def fresh_url(database_url: str, tmp_path: Path) -> Iterator[str]:
+    """A database of this test's own: the module's is migrated already."""
+    if database_url.startswith("sqlite"):
+        yield f"sqlite:///{tmp_path / 'deep' / 'er' / 'isodyn.db'}"
+        return
+    name = f"{database_url.rsplit('/', 1)[1]}_fresh"
+    server = create_database_engine(database_url).execution_options(isolation_level="AUTOCOMMIT")
+    with server.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name}"))
+    yield f"{database_url.rsplit('/', 1)[0]}/{name}"
+    with server.connect() as connection:
+        connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+    server.dispose()
+
+
+def test_many_processes_may_migrate_at_once(fresh_url: str) -> None:
+    code = f"from app.db.engine import migrate; migrate({fresh_url!r})"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    starts = [subprocess.Popen([sys.executable, "-W", "error", "-c", code], env=environment) for _ in range(4)]
+    assert [start.wait(60) for start in starts] == [0, 0, 0, 0]
+    engine = create_database_engine(fresh_url)
+    with engine.connect() as connection:
+        assert differences(connection) == []
+    engine.dispose()
+
+
+def test_sqlite_keeps_what_it_acknowledges(sqlite_url: str) -> None:
+    migrate(sqlite_url)
+    engine = create_database_engine(sqlite_url)
+    with engine.connect() as connection:
+        pragma = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
+        }
+    assert pragma == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 30_000}
+    engine.dispose()
+
+
+def test_readers_do_not_wait_for_a_writer(sessions: sessionmaker[Session]) -> None:
+    with sessions() as writer, sessions() as reader:
+        writer.add(Organisation(name="being written"))
+        writer.flush()
+        assert reader.scalars(select(Organisation.name).where(Organisation.name == "being written")).all() == []
+        writer.rollback()
+
+
+def test_a_savepoint_set_first_belongs_to_the_transaction(sessions: sessionmaker[Session]) -> None:
+    with sessions() as session:
+        with session.begin_nested():
+            session.add(Organisation(name="inside a savepoint"))
+        session.rollback()
+    with sessions() as session:
+        assert session.scalar(select(Organisation).where(Organisation.name == "inside a savepoint")) is None
+
+
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://root@localhost/test"])
+def test_addresses_that_are_not_offered_say_so(url: str) -> None:
+    with pytest.raises(InvalidInput, match="database address"):
+        create_database_engine(url)
