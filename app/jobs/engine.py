@@ -1,0 +1,45 @@
+"""The names and the configuration of the job engine, DBOS (docs/decisions/0003).
+
+The names are constants and never change meaning: rows written by older versions of Isodyn carry them.
+"""
+
+import logging
+
+from dbos import DBOSClient, DBOSConfig, DBOSPortableJSONSerializer
+from sqlalchemy import Engine
+from sqlalchemy.engine import URL
+
+__all__ = ["APPLICATION", "APPLICATION_VERSION", "BUILD", "QUEUE", "REBUILD", "engine_configuration", "open_client"]
+
+APPLICATION = "isodyn"
+APPLICATION_VERSION = "jobs-1"
+QUEUE = "floors"
+REBUILD = "rebuild"
+BUILD = "build"
+
+logging.getLogger("dbos").setLevel(logging.WARNING)
+
+
+def open_client(engine: Engine) -> DBOSClient:
+    """A client that enqueues on `engine`'s connections; a lost database raises instead of blocking the caller."""
+    return DBOSClient(
+        system_database_engine=engine,
+        serializer=DBOSPortableJSONSerializer(),  # the default is pickle
+        application_name=APPLICATION,
+        retry_connection_errors=False,
+        lazy=True,
+    )
+
+
+def engine_configuration(url: URL, executor_id: str) -> DBOSConfig:
+    """The engine's configuration in a worker or a janitor."""
+    return DBOSConfig(
+        name=APPLICATION,
+        system_database_url=url.render_as_string(hide_password=False),
+        application_version=APPLICATION_VERSION,
+        executor_id=executor_id,
+        serializer=DBOSPortableJSONSerializer(),
+        run_migrations=False,
+        log_level="WARNING",
+        enable_otlp=False,
+    )

@@ -1,0 +1,46 @@
+"""How a running job shows where it is, and learns that it should stop."""
+
+import time
+from collections.abc import Callable
+
+from sqlalchemy import update
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.db.tables import Job
+from app.errors import JobCancelled
+
+__all__ = ["JobReporter"]
+
+
+class JobReporter:
+    """Writes progress and message of one job into its row, and reads the cancel flag in the same statement."""
+
+    def __init__(
+        self,
+        sessions: sessionmaker[Session],
+        job_id: str,
+        still_owner: Callable[[int], None],
+        interval_s: float = 0.5,
+    ) -> None:
+        """`still_owner(progress)` raises when the job has been given to another worker. Reports closer together than
+        `interval_s` are dropped, so a chatty fit costs at most two small transactions a second."""
+        self._sessions, self._job_id, self._still_owner = sessions, job_id, still_owner
+        self._interval_s, self._next_s = interval_s, 0.0
+
+    def report(self, fraction: float, message: str) -> None:
+        """Show that `fraction` (0 to 1) is done. Raises JobCancelled if a cancel was requested, or the row is gone."""
+        if time.monotonic() < self._next_s:
+            return
+        progress = round(100 * min(max(fraction, 0.0), 1.0))
+        self._still_owner(progress)
+        statement = (
+            update(Job)
+            .where(Job.id == self._job_id, Job.status == "running")
+            .values(progress=progress, message=message)
+            .returning(Job.cancel_requested)
+        )
+        with self._sessions.begin() as session:
+            cancelled = session.scalar(statement)
+        if cancelled is not False:
+            raise JobCancelled("the job was asked to stop")
+        self._next_s = time.monotonic() + self._interval_s

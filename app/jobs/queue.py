@@ -1,0 +1,139 @@
+"""Asking for background work, in the caller's transaction.
+
+Every change to the jobs of a floor locks the floor's row first, so it is serial per floor on both databases; locks are
+always taken in the order floor, job, anything else.
+"""
+
+from datetime import UTC, datetime
+
+from dbos import EnqueueOptions
+from sqlalchemy import Engine, select, update
+from sqlalchemy.orm import Session
+
+from app.db.tables import Floor, Job, Map
+from app.errors import NotFound
+from app.jobs.engine import APPLICATION_VERSION, BUILD, QUEUE, REBUILD, open_client
+
+__all__ = ["FINAL_STATES", "JobQueue", "claim_generation", "lock_floor"]
+
+FINAL_STATES = ("successful", "failed", "dismissed")
+
+
+class JobQueue:
+    """Enqueues and cancels; runs nothing. One per process, safe to use from several threads."""
+
+    def __init__(self, engine: Engine) -> None:
+        """`engine`: where the sessions given to the methods are bound; migrated (`app.db.engine.migrate`)."""
+        self._client = open_client(engine)
+
+    def enqueue_rebuild(self, session: Session, floor: Floor) -> Job:
+        """The rebuild that will see what this transaction writes: a new job, or the one already waiting.
+
+        The waiting rebuild of a floor is number `claimed_generation + 1`; when it starts it claims that number, so
+        what comes later gets the next. Raises NotFound if the floor is gone.
+        """
+        generation = lock_floor(session, floor.id) + 1
+        job = _job_named(session, _rebuild_id(floor.id, generation))
+        if job is not None and job.status not in FINAL_STATES:
+            return job
+        if job is not None:  # ended before it started
+            claim_generation(session, floor.id, generation)
+            generation += 1
+        job = Job(
+            organisation_id=floor.organisation_id,
+            floor_id=floor.id,
+            kind=REBUILD,
+            workflow_id=_rebuild_id(floor.id, generation),
+        )
+        return self._enqueue(session, job, floor.id, generation)
+
+    def enqueue_build(self, session: Session, map_row: Map) -> Job:
+        """The job that builds this map row; the same one when asked again. Raises NotFound if the floor is gone."""
+        session.flush()
+        lock_floor(session, map_row.floor_id)
+        workflow_id = f"{BUILD}:{map_row.id}"
+        job = _job_named(session, workflow_id)
+        if job is not None:
+            return job
+        job = Job(
+            organisation_id=map_row.organisation_id,
+            floor_id=map_row.floor_id,
+            map_id=map_row.id,
+            kind=BUILD,
+            workflow_id=workflow_id,
+        )
+        return self._enqueue(session, job, map_row.id)
+
+    def request_cancel(self, session: Session, job: Job) -> Job:
+        """End a waiting job now; ask a running one to end at its next report. A job that has ended stays as it is.
+
+        The engine's own entry of a waiting job is not touched: when its turn comes it finds the job dismissed and
+        ends, so there is no moment in which the two disagree.
+        """
+        generation = lock_floor(session, job.floor_id) + 1
+        session.refresh(job)
+        if job.status in FINAL_STATES:
+            return job
+        job.cancel_requested = True
+        if job.status == "accepted":
+            _dismiss(session, job)
+            if job.workflow_id == _rebuild_id(job.floor_id, generation):
+                claim_generation(session, job.floor_id, generation)
+        session.flush()
+        return job
+
+    def close(self) -> None:
+        self._client.destroy()
+
+    def _enqueue(self, session: Session, job: Job, *arguments: str | int) -> Job:
+        session.add(job)
+        session.flush()
+        options = EnqueueOptions(
+            workflow_name=job.kind,
+            workflow_id=job.workflow_id,
+            queue_name=QUEUE,
+            queue_partition_key=job.floor_id,
+            app_version=APPLICATION_VERSION,
+        )
+        self._client.enqueue_in_transaction(session, options, *arguments)
+        return job
+
+
+def lock_floor(session: Session, floor_id: str) -> int:
+    """Lock the floor's row until the transaction ends, and return its `claimed_generation`. Raises NotFound."""
+    session.flush()
+    statement = (
+        update(Floor)
+        .where(Floor.id == floor_id)
+        .values(claimed_generation=Floor.claimed_generation)
+        .returning(Floor.claimed_generation)
+        .execution_options(synchronize_session=False)
+    )
+    generation = session.scalar(statement)
+    if generation is None:
+        raise NotFound(f"no floor {floor_id}")
+    return generation
+
+
+def claim_generation(session: Session, floor_id: str, generation: int) -> None:
+    """From here on whoever asks for a rebuild of the floor gets a later one than `generation`. Locks the floor."""
+    statement = (
+        update(Floor)
+        .where(Floor.id == floor_id, Floor.claimed_generation < generation)
+        .values(claimed_generation=generation)
+    )
+    session.execute(statement)
+
+
+def _dismiss(session: Session, job: Job) -> None:
+    job.status, job.message, job.finished_at = "dismissed", "cancelled before it started", datetime.now(UTC)
+    ended = update(Map).where(Map.id == job.map_id, Map.status == "accepted")
+    session.execute(ended.values(status="dismissed", finished_at=job.finished_at))
+
+
+def _rebuild_id(floor_id: str, generation: int) -> str:
+    return f"{REBUILD}:{floor_id}:{generation}"
+
+
+def _job_named(session: Session, workflow_id: str) -> Job | None:
+    return session.scalar(select(Job).where(Job.workflow_id == workflow_id).execution_options(populate_existing=True))
