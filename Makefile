@@ -1,0 +1,68 @@
+# Isodyn. `make help` explains every target.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# Small matrices are slower on many BLAS threads than on one; processes give the parallelism.
+export OPENBLAS_NUM_THREADS ?= 1
+export OMP_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install install-dev demo serve test test-slow lint format benchmarks evaluate openapi lock clean
+
+help: ## Explain every target
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+install: $(VENV)/.installed ## Create .venv and install the locked dependencies
+install-dev: $(VENV)/.installed-dev ## The same, with what the tests need
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Isodyn needs Python 3.11 or newer; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: $(BIN)/python requirements.lock pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
+	@touch $@
+
+demo: install ## Make a building, walk it, map it, locate in it; leaves the server up (ARGS="--once" exits)
+	$(BIN)/isodyn demo $(ARGS)
+
+serve: install ## Run the API, the page and an embedded worker on port 8300
+	$(BIN)/isodyn serve $(ARGS)
+
+test: install-dev ## Install, and run all tests but the slow ones
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-slow: install-dev ## Run the slow tests
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: install-dev ## Style, types and import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: install-dev ## Format the code
+	$(BIN)/ruff check --fix --select I .
+	$(BIN)/ruff format .
+
+benchmarks: install-dev ## Measure every performance claim; each prints both sides and a ratio
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+evaluate: install ## Evaluate on real walks: make evaluate DIR=path/to/site
+	$(BIN)/isodyn evaluate $(DIR)
+
+openapi: install ## Write the OpenAPI document to docs/openapi.json
+	$(BIN)/isodyn openapi --output docs/openapi.json
+
+lock: install-dev ## Resolve the dependencies anew
+	$(BIN)/python -m pip install --quiet pip-tools
+	$(BIN)/pip-compile --quiet --upgrade --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-annotate --no-header -o requirements.lock pyproject.toml
+	$(BIN)/pip-compile --quiet --upgrade --extra dev --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-annotate --no-header -o requirements-dev.lock pyproject.toml
+
+clean: ## Remove the environment and caches (never your data in var/)
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,44 @@
+"""Keys in `Authorization: Bearer isd_...`, and the scopes an endpoint asks for."""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import Depends
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from app.api.context import ContextDep
+from app.api.problems import Forbidden, Unauthorised
+from app.services.manage_keys import Identity, recognise_key
+
+__all__ = ["AdminOnly", "Identity", "Locating", "Reading", "SurveyReading", "SurveyWriting", "MapWriting"]
+
+_bearer = HTTPBearer(auto_error=False, description="an API key, `isd_...`; `isodyn keys create` makes one")
+
+
+def _identity(
+    context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+) -> Identity:
+    if credentials is None:
+        raise Unauthorised("send your key as `Authorization: Bearer isd_...`")
+    with context.sessions() as session:
+        identity = recognise_key(session, credentials.credentials)
+    if identity is None:
+        raise Unauthorised("this key is not known or was revoked; `isodyn keys create` makes a new one")
+    return identity
+
+
+def _needs(*any_of: str) -> Callable[[Identity], Identity]:
+    def check(identity: Annotated[Identity, Depends(_identity)]) -> Identity:
+        if not identity.may(*any_of):
+            raise Forbidden(f"this needs a key with scope {' or '.join(any_of)}")
+        return identity
+
+    return check
+
+
+AdminOnly = Annotated[Identity, Depends(_needs("admin"))]
+Reading = Annotated[Identity, Depends(_needs("map:read", "map:write"))]
+MapWriting = Annotated[Identity, Depends(_needs("map:write"))]
+SurveyReading = Annotated[Identity, Depends(_needs("survey:write", "map:read", "map:write"))]
+SurveyWriting = Annotated[Identity, Depends(_needs("survey:write"))]
+Locating = Annotated[Identity, Depends(_needs("locate"))]

@@ -1,0 +1,46 @@
+"""What every endpoint may use, made once by `app.main` and found on the application's state."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request
+from sqlalchemy import Engine
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.api.metrics import Metrics
+from app.blobs import BlobStore
+from app.jobs.queue import JobQueue
+from app.services.grid_cache import GridCache
+from app.settings import Settings
+
+__all__ = ["Context", "ContextDep", "context_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """The open handles of a web process."""
+
+    settings: Settings
+    engine: Engine
+    sessions: sessionmaker[Session]
+    blobs: BlobStore
+    queue: JobQueue
+    grids: GridCache
+    metrics: Metrics
+
+    @contextmanager
+    def transaction(self) -> Iterator[Session]:
+        """One transaction: committed before the answer is made, rolled back on any error."""
+        with self.sessions.begin() as session:
+            yield session
+
+
+def context_of(request: Request) -> Context:
+    """The context of the application that serves this request."""
+    context: Context = request.app.state.context
+    return context
+
+
+ContextDep = Annotated[Context, Depends(context_of)]

@@ -1,0 +1,72 @@
+"""`Idempotency-Key` on POSTs that create: the same key and request get the same answer, and create once."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from hashlib import sha256
+from typing import Annotated
+
+from fastapi import Header, Request
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from app.api.context import Context
+from app.db.tables import Idempotency
+from app.errors import Conflict
+from app.services.manage_keys import Identity
+
+__all__ = ["IdempotencyKey", "answer_once"]
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=200,
+        pattern=r"^[\x21-\x7e]+$",
+        description="repeat a request safely: the same key gives the first answer again",
+    ),
+]
+Create = Callable[[Session], tuple[int, BaseModel]]
+
+
+def answer_once(
+    context: Context, identity: Identity, request: Request, key: str | None, body: bytes, create: Create
+) -> JSONResponse:
+    """Create in one transaction and answer; with a key, remember the answer in the same transaction.
+
+    Raises Conflict when the key was used for a different request.
+    """
+    fingerprint = sha256(f"{request.method} {request.url.path}?{request.url.query}\n".encode() + body).hexdigest()
+    for attempt in (1, 2):
+        try:
+            with context.transaction() as session:
+                if key is not None:
+                    earlier = session.get(Idempotency, (identity.organisation_id, key))
+                    if earlier is not None:
+                        return _again(earlier, fingerprint)
+                status, answer = create(session)
+                content = answer.model_dump(mode="json")
+                if key is not None:
+                    session.add(
+                        Idempotency(
+                            organisation_id=identity.organisation_id,
+                            key=key,
+                            fingerprint=fingerprint,
+                            status_code=status,
+                            body=content,
+                            created_at=datetime.now(UTC),
+                        )
+                    )
+            return JSONResponse(content, status)
+        except IntegrityError:  # somebody else used the key, or created the same object, a moment earlier
+            if attempt == 2:
+                raise Conflict("the same request is being served at this moment; try again") from None
+    raise AssertionError("unreachable")
+
+
+def _again(earlier: Idempotency, fingerprint: str) -> JSONResponse:
+    if earlier.fingerprint != fingerprint:
+        raise Conflict("this Idempotency-Key was used for a different request; use a new one")
+    return JSONResponse(earlier.body, earlier.status_code, headers={"Idempotent-Replayed": "true"})

@@ -1,0 +1,293 @@
+"""Maps: ask for one, look at it, ask it for the field, take it away as a file or a picture."""
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from app.api.auth import Identity, MapWriting, Reading
+from app.api.buildings import find_floor
+from app.api.context import Context, ContextDep
+from app.api.idempotency import IdempotencyKey, answer_once
+from app.api.jobs import JobView, show_job
+from app.api.listing import Page, PagingDep, list_page
+from app.api.models import Finite, Id, Metres, Point, RequestModel
+from app.api.problems import ERROR_RESPONSES
+from app.db.tables import Floor, Map, Survey
+from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
+from app.field.grid import FieldGrid
+from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
+from app.services.export_map import MEDIA_TYPES, ExportFormat, export_map
+
+__all__ = ["MapView", "router"]
+
+router = APIRouter(prefix="/v1", tags=["maps"], responses=ERROR_RESPONSES)
+MAX_FIELD_POINTS = 100_000
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+
+
+class NewMap(RequestModel):
+    """What to build; everything left out has a good default."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert"}]})
+    engine: Literal["hilbert", "exact"] = "hilbert"
+    components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
+    kernel: Literal["squared_exponential", "matern32", "matern52"] | None = None
+    resolution_m: Annotated[Finite, Field(ge=0.05, le=5.0)] = 0.25
+    heights_m: Annotated[list[Metres], Field(min_length=1, max_length=1)] | None = None
+    survey_ids: Annotated[
+        list[Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]], Field(min_length=1, max_length=10_000)
+    ] | None = None  # fmt: skip
+    activate: bool = True
+
+
+class ScoreView(BaseModel):
+    """Leave-one-survey-out score; one value per component."""
+
+    rmse_ut: list[float]
+    coverage_2sigma: list[float]
+    nlpd: float
+    held_out_samples: int
+
+
+class MapView(BaseModel):
+    id: str
+    floor_id: str
+    engine: str
+    components: Components | None
+    status: Literal["accepted", "running", "ready", "failed", "dismissed"]
+    active: bool
+    created_at: datetime
+    bounds_m: Annotated[list[float] | None, Field(description="x_min, y_min, z_min, x_max, y_max, z_max")]
+    resolution_m: float
+    hyperparameters: dict[str, Any] | None
+    score: ScoreView | None
+    score_reason: Annotated[str | None, Field(description="why there is no score")]
+    survey_ids: list[str]
+    sha256: Annotated[str | None, Field(description="of the grid: the map's identity and ETag")]
+
+
+class NewMapAnswer(BaseModel):
+    map: MapView
+    job: JobView
+
+
+class FieldQuery(RequestModel):
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"points_m": [[3.0, 4.0, 1.2]]}]})
+    points_m: Annotated[list[Point], Field(min_length=1, max_length=MAX_FIELD_POINTS)]
+    gradient: bool = False
+
+
+class FieldAnswer(BaseModel):
+    """One row per point, one column per component; null where nothing was measured."""
+
+    components: list[str]
+    mean_ut: list[list[float] | None]
+    sd_ut: list[list[float] | None]
+    measured: list[bool]
+    points_m: Annotated[list[list[float]], Field(description="the points, as asked")]
+    gradient_ut_per_m: Annotated[
+        list[list[list[float | None]] | None] | None,
+        Field(description="per component, with x, y, z; z is null in a map of one height"),
+    ] = None
+
+
+def show_map(row: Map, active_map_id: str | None) -> MapView:
+    return MapView.model_validate(
+        {
+            "engine": row.spec.get("engine", "hilbert"), "active": row.id == active_map_id, "sha256": row.grid_sha256,
+            "resolution_m": row.spec.get("resolution_m", 0.25),
+            "components": row.components or row.spec.get("components"),
+            **{name: getattr(row, name) for name in
+               ("id", "floor_id", "status", "created_at", "bounds_m", "hyperparameters", "score", "score_reason",
+                "survey_ids")},
+        }
+    )  # fmt: skip
+
+
+def _find_map(session: Session, identity: Identity, map_id: str) -> Map:
+    row = session.get(Map, map_id)
+    if row is None or row.organisation_id != identity.organisation_id:
+        raise NotFound(f"no map {map_id}")
+    return row
+
+
+def _check_surveys(session: Session, floor_id: str, body: NewMap) -> list[str]:
+    """The surveys to build from, sorted; refuses what could only fail later."""
+    statement = select(Survey.id, Survey.frame).where(Survey.floor_id == floor_id)
+    rows = session.execute(
+        statement.where(Survey.included) if body.survey_ids is None else statement.where(Survey.id.in_(body.survey_ids))
+    ).all()
+    unknown = sorted(set(body.survey_ids or ()) - {row.id for row in rows})
+    if unknown:
+        raise InvalidInput("some surveys are not on this floor", *[Fault("/body/survey_ids", i) for i in unknown[:20]])
+    if not rows:
+        raise Conflict("the floor has no included survey to build a map from; upload one first")
+    frames: set[SampleFrame] = {row.frame for row in rows}
+    best = richest_components(frames)
+    order = list(COMPONENT_NAMES)
+    if body.components is not None and order.index(body.components) < order.index(best):
+        raise IncompatibleFrames(
+            f"surveys in the {' and '.join(sorted(frames))} frame cannot all give a {body.components} map; "
+            f"ask for {best}, or leave the others out by survey_ids"
+        )
+    return sorted(row.id for row in rows)
+
+
+@router.post("/floors/{floor_id}/maps", status_code=202, response_model=NewMapAnswer, summary="Build a map")
+def create_map(
+    floor_id: Id, body: NewMap, request: Request, context: ContextDep, identity: MapWriting, key: IdempotencyKey = None
+) -> Response:
+    """A floor with `auto_build` builds by itself after each change; this builds with parameters of your own."""
+
+    def create(session: Session) -> tuple[int, BaseModel]:
+        floor = find_floor(session, identity, floor_id)
+        row = Map(
+            organisation_id=floor.organisation_id,
+            floor_id=floor.id,
+            status="accepted",
+            activate=body.activate,
+            spec=body.model_dump(exclude={"survey_ids", "activate"}, exclude_none=True),
+            survey_ids=_check_surveys(session, floor.id, body),
+        )
+        session.add(row)
+        session.flush()
+        job = context.queue.enqueue_build(session, row)
+        return 202, NewMapAnswer(map=show_map(row, floor.active_map_id), job=show_job(job))
+
+    return answer_once(context, identity, request, key, body.model_dump_json().encode(), create)
+
+
+@router.get("/floors/{floor_id}/maps", summary="List a floor's maps")
+def list_maps(floor_id: Id, context: ContextDep, identity: Reading, paging: PagingDep) -> Page[MapView]:
+    with context.transaction() as session:
+        active = find_floor(session, identity, floor_id).active_map_id
+        mine = select(Map).where(Map.floor_id == floor_id)
+        return list_page(session, mine, Map.id, paging, lambda row: show_map(row, active))
+
+
+@router.get("/maps/{map_id}", summary="One map: its state, score and parameters")
+def get_map(map_id: Id, context: ContextDep, identity: Reading) -> MapView:
+    with context.transaction() as session:
+        row = _find_map(session, identity, map_id)
+        return show_map(row, session.get_one(Floor, row.floor_id).active_map_id)
+
+
+@router.post("/maps/{map_id}/activate", summary="Answer with this map from now on")
+def activate_map(map_id: Id, context: ContextDep, identity: MapWriting) -> MapView:
+    """Moves one pointer; works on any finished map of the floor, so it also rolls back."""
+    with context.transaction() as session:
+        row = _find_map(session, identity, map_id)
+        if row.status != "ready":
+            raise Conflict(f"map {map_id} is {row.status}; only a finished map can be activated")
+        session.execute(
+            update(Floor)
+            .where(Floor.id == row.floor_id)
+            .values(active_map_id=row.id, active_sequence=Floor.build_sequence)
+        )
+        return show_map(row, row.id)
+
+
+@router.post("/maps/{map_id}/field", summary="The field at points")
+def read_field(map_id: Id, body: FieldQuery, context: ContextDep, identity: Reading) -> FieldAnswer:
+    """Points outside the map or not measured answer null and `measured: false`, never an invented value."""
+    grid, _ = _ready_grid(context, identity, map_id)
+    values = grid.at(body.points_m)  # type: ignore[arg-type]  # numpy takes the lists as they are
+    measured = values.measured.tolist()
+
+    def shown(rows: list[Any]) -> list[Any]:
+        return [row if ok else None for row, ok in zip(rows, measured, strict=True)]
+
+    gradient = None
+    if body.gradient:
+        rows = values.gradient_uT_per_m.tolist()
+        gradient = shown([[[*dxy, None] for dxy in row] for row in rows])
+    return FieldAnswer(
+        components=list(grid.component_names),
+        mean_ut=shown(values.mean_uT.tolist()),
+        sd_ut=shown(values.sd_uT.tolist()),
+        measured=measured,
+        points_m=body.points_m,
+        gradient_ut_per_m=gradient,
+    )
+
+
+@router.get("/maps/{map_id}/quality", summary="Score, noise and every survey's consistency")
+def get_quality(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
+    with context.transaction() as session:
+        row = _find_map(session, identity, map_id)
+        sha256 = row.quality_sha256
+    if sha256 is None:
+        raise NotFound(f"map {map_id} is {row.status}; it has no quality report yet")
+    return _immutable(request, sha256, lambda: context.blobs.get(sha256), "application/json")
+
+
+@router.get(
+    "/maps/{map_id}/export",
+    summary="The map as a file",
+    response_class=Response,
+    responses={200: {"content": {media: _BINARY for media in MEDIA_TYPES.values()}}},
+)
+def get_export(
+    map_id: Id, request: Request, context: ContextDep, identity: Reading, format: Annotated[ExportFormat, Query()]
+) -> Response:
+    grid, sha256 = _ready_grid(context, identity, map_id)
+    name = f'attachment; filename="isodyn-{sha256[:12]}.{ {"netcdf": "nc"}.get(format, format) }"'
+    response = _immutable(request, f"{sha256}-{format}", lambda: export_map(grid, format), MEDIA_TYPES[format])
+    response.headers["Content-Disposition"] = name
+    return response
+
+
+@router.get(
+    "/maps/{map_id}/heatmap.png",
+    summary="A picture of one layer",
+    response_class=Response,
+    responses={200: {"content": {"image/png": _BINARY}}},
+)
+def get_heatmap(
+    map_id: Id,
+    request: Request,
+    context: ContextDep,
+    identity: Reading,
+    layer: Annotated[
+        str, Query(max_length=40, pattern=r"^[a-z_]+$", examples=["norm", "bx", "sd", "gradient"])
+    ] = "norm",
+) -> Response:
+    from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it
+
+    grid, sha256 = _ready_grid(context, identity, map_id)
+    return _immutable(request, f"{sha256}-{layer}", lambda: heatmap_png(grid, layer), "image/png")
+
+
+@router.get(
+    "/maps/{map_id}/view.html",
+    summary="The map as one self-contained 3-D page",
+    response_class=Response,
+    responses={200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
+)
+def get_view(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
+    from app.viewer.static_view import static_view_html  # viser is loaded only when somebody looks
+
+    grid, sha256 = _ready_grid(context, identity, map_id)
+    title = f"Magnetic map {map_id}"
+    return _immutable(request, f"{sha256}-view", lambda: static_view_html(grid, [], title).encode(), "text/html")
+
+
+def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
+    with context.transaction() as session:
+        row = _find_map(session, identity, map_id)
+        floor_id, sha256, status = row.floor_id, row.grid_sha256, row.status
+    if sha256 is None:
+        raise Conflict(f"map {map_id} is {status}; it has no field yet")
+    return context.grids.grid(floor_id, sha256), sha256
+
+
+def _immutable(request: Request, tag: str, make: Any, media_type: str) -> Response:
+    """A response that never changes: a strong ETag of its content's hash, 304 when the caller has it already."""
+    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, max-age=31536000, immutable"}
+    if f'"{tag}"' in request.headers.get("if-none-match", ""):
+        return Response(status_code=304, headers=headers)
+    return Response(make(), media_type=media_type, headers=headers)

@@ -1,0 +1,26 @@
+"""Field types that requests and responses share: bounded, finite, free of control characters."""
+
+from typing import Annotated
+
+from fastapi import Path
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+__all__ = ["Finite", "Id", "Links", "Metres", "Name", "Point", "RequestModel"]
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
+Point = Annotated[list[Metres], Field(min_length=3, max_length=3, examples=[[12.3, 4.5, 1.2]])]
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Id = Annotated[str, Path(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_-]+$", description="an opaque id")]
+
+
+class RequestModel(BaseModel):
+    """A request body: unknown names are refused, so that a misspelt option is never silently ignored."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Links(BaseModel):
+    """Where the rest of a list is; `next` is left out on the last page."""
+
+    next: str | None = None

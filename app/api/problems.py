@@ -1,0 +1,155 @@
+"""RFC 9457: every refusal is `application/problem+json` with a stable `type`, a sentence, and `errors[]` saying where.
+
+| type (under https://isodyn.dev/problems/) | status | when                                                        |
+|---|---|---|
+| unreadable-survey, invalid-window, incompatible-frames, invalid-input | 422 | what was sent cannot be used  |
+| unauthorised | 401 | no key, or one that is not known                                                          |
+| forbidden    | 403 | the key lacks the scope                                                                   |
+| not-found    | 404 | no such object for this key                                                               |
+| conflict     | 409 | the object's present state forbids it                                                     |
+| too-large    | 413 | more bytes than the limit                                                                 |
+| unavailable  | 503 | the database or the blob store cannot be reached                                          |
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from sqlalchemy.exc import DBAPIError, OperationalError
+from starlette.exceptions import HTTPException
+
+from app.errors import (
+    Conflict,
+    CorruptArtefact,
+    Fault,
+    IncompatibleFrames,
+    InvalidInput,
+    InvalidWindow,
+    IsodynError,
+    NotFound,
+    TooLarge,
+    UnreadableSurvey,
+)
+
+__all__ = ["ERROR_RESPONSES", "Forbidden", "Problem", "Unauthorised", "add_problem_handlers", "problem_response"]
+
+TYPE_BASE = "https://isodyn.dev/problems/"
+
+
+class Unauthorised(IsodynError):
+    """No key, or one that is not known."""
+
+
+class Forbidden(IsodynError):
+    """The key lacks the scope."""
+
+
+# The nearest ancestor decides.
+_KINDS: dict[type[IsodynError], tuple[int, str, str]] = {
+    UnreadableSurvey: (422, "unreadable-survey", "The survey cannot be read"),
+    InvalidWindow: (422, "invalid-window", "The window cannot be matched"),
+    IncompatibleFrames: (422, "incompatible-frames", "The map cannot answer this frame"),
+    InvalidInput: (422, "invalid-input", "The request cannot be used"),
+    Unauthorised: (401, "unauthorised", "A key is needed"),
+    Forbidden: (403, "forbidden", "The key lacks the scope"),
+    NotFound: (404, "not-found", "Not found"),
+    Conflict: (409, "conflict", "The object's state forbids it"),
+    TooLarge: (413, "too-large", "Too large"),
+    CorruptArtefact: (500, "corrupt-artefact", "Stored data is damaged"),
+    IsodynError: (500, "internal", "Something went wrong here"),
+}
+
+
+class ProblemError(BaseModel):
+    location: str = Field(description="a JSON pointer, a parameter's name, or a line and column", examples=["line 7"])
+    reason: str
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem details."""
+
+    type: str = Field(examples=[TYPE_BASE + "not-found"])
+    title: str
+    status: int
+    detail: str
+    errors: list[ProblemError] = Field(default_factory=list)
+
+
+def _documented(description: str) -> dict[str, Any]:
+    schema = {"$ref": "#/components/schemas/Problem"}
+    return {"description": description, "content": {"application/problem+json": {"schema": schema}}}
+
+
+ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
+    400: _documented("The request is not well-formed HTTP or JSON"),
+    401: _documented("No key, or one that is not known"),
+    403: _documented("The key lacks the scope"),
+    404: _documented("No such object for this key"),
+    409: _documented("The object's present state forbids it"),
+    413: _documented("More bytes than the limit"),
+    422: _documented("What was sent cannot be used; `errors` says where and why"),
+    503: _documented("The database or the blob store cannot be reached; try again"),
+}
+
+
+def problem_response(
+    status: int, kind: str, title: str, detail: str, faults: Sequence[Fault] = (), headers: dict[str, str] | None = None
+) -> JSONResponse:
+    """One problem document."""
+    problem = Problem(
+        type=TYPE_BASE + kind,
+        title=title,
+        status=status,
+        detail=detail,
+        errors=[ProblemError(location=fault.location, reason=fault.reason) for fault in faults],
+    )
+    return JSONResponse(problem.model_dump(), status, headers=headers, media_type="application/problem+json")
+
+
+def add_problem_handlers(app: FastAPI) -> None:
+    """Turn every error of the tree, of validation, of routing and of the database into a problem document."""
+    app.add_exception_handler(IsodynError, _isodyn_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+    app.add_exception_handler(HTTPException, _http_exception)
+    app.add_exception_handler(OperationalError, _database_unavailable)
+    app.add_exception_handler(DBAPIError, _database_refused)
+
+
+def isodyn_problem(error: IsodynError) -> JSONResponse:
+    """The problem document of an error of the tree."""
+    status, kind, title = next(_KINDS[cls] for cls in type(error).__mro__ if cls in _KINDS)
+    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    return problem_response(status, kind, title, str(error), error.faults, headers)
+
+
+async def _isodyn_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, IsodynError)
+    return isodyn_problem(error)
+
+
+async def _validation_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    faults = [Fault("/" + "/".join(str(part) for part in each["loc"]), each["msg"]) for each in error.errors()]
+    detail = f"{faults[0].location}: {faults[0].reason}" if faults else "the request does not fit its description"
+    return problem_response(422, "invalid-input", "The request cannot be used", detail, faults[:50])
+
+
+async def _http_exception(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    title = {404: "Not found", 405: "Method not allowed"}.get(error.status_code, "The request cannot be served")
+    kind = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "bad-request")
+    return problem_response(
+        error.status_code, kind, title, str(error.detail), headers=dict(error.headers) if error.headers else None
+    )
+
+
+async def _database_unavailable(_: Request, error: Exception) -> JSONResponse:
+    detail = "the database cannot be reached now; nothing was stored, try again"
+    return problem_response(503, "unavailable", "Unavailable", detail, headers={"Retry-After": "5"})
+
+
+async def _database_refused(_: Request, error: Exception) -> JSONResponse:
+    return problem_response(500, "internal", "Something went wrong here", "the database refused the statement")

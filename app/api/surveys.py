@@ -1,0 +1,229 @@
+"""Surveys: upload a walk, see what was read, how it fits the others, leave it out, delete it."""
+
+import json
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.api.auth import Identity, SurveyReading, SurveyWriting
+from app.api.body import read_upload
+from app.api.buildings import find_floor
+from app.api.context import Context, ContextDep
+from app.api.idempotency import IdempotencyKey, answer_once
+from app.api.jobs import JobView, show_job
+from app.api.listing import Page, PagingDep, list_page
+from app.api.models import Id, Name, RequestModel
+from app.api.problems import ERROR_RESPONSES
+from app.db.tables import Floor, Map, Survey
+from app.errors import NotFound
+from app.services.artefacts import samples_from_bytes
+from app.services.receive_survey import parse_survey, record_survey
+
+__all__ = ["SurveyView", "router"]
+
+router = APIRouter(prefix="/v1", tags=["surveys"], responses=ERROR_RESPONSES)
+SurveyFormat = Literal["csv", "parquet", "ndjson", "indoor-location-2020"]
+
+_FILES: dict[str, Any] = {
+    "required": True,
+    "content": {
+        "text/csv": {
+            "schema": {"type": "string"},
+            "example": "t_s,x_m,y_m,z_m,bx_ut,by_ut,bz_ut\n"
+            "0.0,1.0,2.0,1.2,19.8,2.1,-43.0\n0.1,1.1,2.0,1.2,19.9,2.0,-43.1\n",
+        },
+        "application/x-ndjson": {"schema": {"type": "string"}},
+        "application/vnd.apache.parquet": {"schema": {"type": "string", "format": "binary"}},
+        "text/plain": {"schema": {"type": "string"}},
+        "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+    },
+}
+
+
+class SurveyView(BaseModel):
+    id: str
+    floor_id: str
+    name: str
+    format: str
+    frame: str
+    sample_count: int
+    included: bool
+    sha256: Annotated[str, Field(description="of the uploaded bytes")]
+    created_at: datetime
+
+
+class ReceivedSurvey(BaseModel):
+    """The survey, and the job that maps it (null when the floor does not build by itself)."""
+
+    survey: SurveyView
+    job: JobView | None
+
+
+class SurveyPatch(RequestModel):
+    included: Annotated[bool, Field(description="false leaves the survey out of maps built from now on")]
+
+
+class SurveySamples(BaseModel):
+    """Samples as the map sees them, evenly thinned to `limit`; columns by name."""
+
+    frame: str
+    count: int
+    columns: list[str]
+    rows: list[list[float]]
+
+
+def show_survey(row: Survey) -> SurveyView:
+    names = ("id", "floor_id", "name", "format", "frame", "sample_count", "included", "created_at")
+    return SurveyView(sha256=row.raw_sha256, **{name: getattr(row, name) for name in names})
+
+
+def _find_survey(session: Session, identity: Identity, survey_id: str) -> Survey:
+    row = session.get(Survey, survey_id)
+    if row is None or row.organisation_id != identity.organisation_id:
+        raise NotFound(f"no survey {survey_id}")
+    return row
+
+
+@router.post(
+    "/floors/{floor_id}/surveys",
+    status_code=202,
+    response_model=ReceivedSurvey,
+    responses={200: {"model": ReceivedSurvey, "description": "The same bytes were uploaded before"}},
+    openapi_extra={"requestBody": _FILES},
+    summary="Upload a survey",
+)
+async def upload_survey(
+    floor_id: Id,
+    request: Request,
+    context: ContextDep,
+    identity: SurveyWriting,
+    format: Annotated[SurveyFormat, Query(description="what the bytes are")] = "csv",
+    frame: Annotated[
+        Literal["building", "level", "norm"], Query(description="what b is when there is no quaternion")
+    ] = "building",
+    name: Annotated[Name | None, Query()] = None,
+    key: IdempotencyKey = None,
+) -> Response:
+    """The body is the file; `Content-Encoding: gzip` or `zstd` is understood. It is parsed now and refused with line
+    and reason if it cannot be read; once accepted it is on disk, and a job maps it."""
+    elevation_m = await run_in_threadpool(_elevation_m, context, identity, floor_id)
+    data = await read_upload(request, context.settings.max_upload_bytes)
+
+    def receive() -> Response:
+        parsed = parse_survey(
+            context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=elevation_m
+        )
+
+        def create(session: Session) -> tuple[int, BaseModel]:
+            floor = find_floor(session, identity, floor_id)
+            survey, job, new = record_survey(session, context.queue, floor, parsed)
+            view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
+            return 202 if new else 200, view
+
+        return answer_once(context, identity, request, key, parsed.raw_sha256.encode(), create)
+
+    return await run_in_threadpool(receive)
+
+
+def _elevation_m(context: Context, identity: Identity, floor_id: str) -> float:
+    with context.transaction() as session:
+        return find_floor(session, identity, floor_id).elevation_m
+
+
+@router.get("/floors/{floor_id}/surveys", summary="List a floor's surveys")
+def list_surveys(floor_id: Id, context: ContextDep, identity: SurveyReading, paging: PagingDep) -> Page[SurveyView]:
+    with context.transaction() as session:
+        find_floor(session, identity, floor_id)
+        return list_page(session, select(Survey).where(Survey.floor_id == floor_id), Survey.id, paging, show_survey)
+
+
+@router.get("/surveys/{survey_id}", summary="One survey")
+def get_survey(survey_id: Id, context: ContextDep, identity: SurveyReading) -> SurveyView:
+    with context.transaction() as session:
+        return show_survey(_find_survey(session, identity, survey_id))
+
+
+@router.get("/surveys/{survey_id}/report", summary="What was read, and what the reader assumed")
+def get_report(survey_id: Id, context: ContextDep, identity: SurveyReading) -> dict[str, Any]:
+    with context.transaction() as session:
+        return _find_survey(session, identity, survey_id).report
+
+
+@router.get("/surveys/{survey_id}/consistency", summary="How the survey fits the map of the others (Kuevor B14)")
+def get_consistency(
+    survey_id: Id,
+    context: ContextDep,
+    identity: SurveyReading,
+    map_id: Annotated[
+        str | None, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$", description="default: the floor's active map")
+    ] = None,
+) -> dict[str, Any]:
+    """The survey against the map of *the other* surveys, whole and in segments, per component."""
+    with context.transaction() as session:
+        survey = _find_survey(session, identity, survey_id)
+        wanted = map_id or session.scalars(select(Floor.active_map_id).where(Floor.id == survey.floor_id)).one()
+        map_row = session.get(Map, wanted) if wanted else None
+        if map_row is None or map_row.floor_id != survey.floor_id or map_row.quality_sha256 is None:
+            raise NotFound("this floor has no such finished map yet; wait for its job, or name another map_id")
+        quality_sha256, map_id = map_row.quality_sha256, map_row.id
+    report = json.loads(context.blobs.get(quality_sha256))["surveys"].get(survey_id)
+    if report is None:
+        raise NotFound(f"survey {survey_id} is not part of map {map_id}")
+    return {"survey_id": survey_id, "map_id": map_id, **report}
+
+
+@router.get("/surveys/{survey_id}/samples", summary="The samples as the map sees them")
+def get_samples(
+    survey_id: Id,
+    context: ContextDep,
+    identity: SurveyReading,
+    limit: Annotated[int, Query(ge=1, le=100_000, description="evenly thinned to at most this many")] = 10_000,
+) -> SurveySamples:
+    with context.transaction() as session:
+        sha256 = _find_survey(session, identity, survey_id).samples_sha256
+    samples = samples_from_bytes(context.blobs.get(sha256))
+    kept = slice(None, None, -(-len(samples) // limit))
+    field_columns = ["b_ut"] if samples.frame == "norm" else ["bx_ut", "by_ut", "bz_ut"]
+    rows = [
+        [float(t), *map(float, p), *map(float, b)]
+        for t, p, b in zip(samples.t_s[kept], samples.p_building_m[kept], samples.B_uT[kept], strict=True)
+    ]
+    return SurveySamples(
+        frame=samples.frame, count=len(samples), columns=["t_s", "x_m", "y_m", "z_m", *field_columns], rows=rows
+    )
+
+
+@router.patch("/surveys/{survey_id}", summary="Leave a survey out of maps, or take it in again")
+def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> SurveyView:
+    with context.transaction() as session:
+        survey = _find_survey(session, identity, survey_id)
+        changed, survey.included = survey.included != body.included, body.included
+        session.flush()
+        if changed:
+            _rebuild(session, context, survey.floor_id)
+        return show_survey(survey)
+
+
+@router.delete("/surveys/{survey_id}", status_code=204, summary="Delete a survey")
+def delete_survey(survey_id: Id, context: ContextDep, identity: SurveyWriting) -> Response:
+    """Maps already built keep what they learned from it; the next build does not have it."""
+    with context.transaction() as session:
+        survey = _find_survey(session, identity, survey_id)
+        floor_id = survey.floor_id
+        session.delete(survey)
+        session.flush()
+        _rebuild(session, context, floor_id)
+    return Response(status_code=204)
+
+
+def _rebuild(session: Session, context: Context, floor_id: str) -> None:
+    """Set off a rebuild if the floor builds by itself and has anything left to build from."""
+    floor = session.get_one(Floor, floor_id)
+    left = session.scalars(select(Survey.id).where(Survey.floor_id == floor_id, Survey.included).limit(1)).first()
+    if floor.auto_build and left is not None:
+        context.queue.enqueue_rebuild(session, floor)

@@ -1,0 +1,128 @@
+"""`isodyn doctor`: what is wrong with this installation, and what to do about it."""
+
+import os
+import shutil
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from app.settings import Settings
+
+__all__ = ["Finding", "doctor", "examine"]
+
+LOW_DISK_BYTES = 2**30
+FRESH_BEAT_S = 120
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing looked at: `ok` True, False (broken) or None (works, could be better), and what to do."""
+
+    what: str
+    ok: bool | None
+    seen: str
+    advice: str = ""
+
+
+def doctor() -> None:
+    """Look at Python, disk, database, blobs, worker and port; say what is wrong and what to do."""
+    findings = examine(Settings())
+    table = Table("", "what", "seen", "what to do", show_lines=False)
+    marks = {True: "[green]ok[/green]", None: "[yellow]note[/yellow]", False: "[red]wrong[/red]"}
+    for finding in findings:
+        table.add_row(marks[finding.ok], finding.what, finding.seen, finding.advice)
+    Console().print(table)
+    if any(finding.ok is False for finding in findings):
+        raise typer.Exit(1)
+
+
+def examine(settings: Settings) -> list[Finding]:
+    """Every finding; a check that itself fails is a finding, never a traceback."""
+    checks: list[tuple[str, Callable[[Settings], Iterator[Finding]]]] = [
+        ("python", _python),
+        ("data folder", _data_folder),
+        ("database", _database),
+        ("blob store", _blobs),
+        ("port", _port),
+    ]
+    findings: list[Finding] = []
+    for what, check in checks:
+        try:
+            findings += check(settings)
+        except Exception as error:
+            findings.append(Finding(what, False, f"{type(error).__name__}: {str(error).splitlines()[0][:200]}"))
+    return findings
+
+
+def _python(_: Settings) -> Iterator[Finding]:
+    version = sys.version.split()[0]
+    yield Finding("python", sys.version_info >= (3, 11), version, "" if sys.version_info >= (3, 11) else "use 3.11+")
+    cores = os.cpu_count() or 1
+    yield Finding("cores", True if cores > 1 else None, str(cores), "" if cores > 1 else "fits and answers share one")
+
+
+def _data_folder(settings: Settings) -> Iterator[Finding]:
+    folder = settings.data_dir.resolve()
+    if not folder.exists():
+        yield Finding("data folder", None, f"{folder} does not exist yet", "`isodyn serve` makes it")
+        return
+    writable = os.access(folder, os.W_OK)
+    yield Finding("data folder", writable, str(folder), "" if writable else "give this user the right to write there")
+    free = shutil.disk_usage(folder).free
+    roomy = free > LOW_DISK_BYTES
+    yield Finding("disk", roomy, f"{free / 2**30:.1f} GiB free", "" if roomy else "make room: uploads will fail")
+
+
+def _database(settings: Settings) -> Iterator[Finding]:
+    from sqlalchemy import select
+
+    from app.db.engine import create_database_engine, migration_state, session_factory
+    from app.db.tables import Job, Key, Worker, utc_now
+
+    url = settings.resolved_database_url
+    if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).exists():
+        yield Finding("database", None, "not made yet", "`isodyn serve` makes it")
+        return
+    engine = create_database_engine(url)
+    try:
+        at, head = migration_state(engine)
+        advice = "" if at == head else "`isodyn serve` brings it up to date"
+        yield Finding("database", at == head, f"{engine.dialect.name}, schema {at or 'none'} of {head}", advice)
+        if at != head:
+            return
+        with session_factory(engine).begin() as session:
+            keys = len(session.scalars(select(Key.id).where(Key.revoked_at.is_(None))).all())
+            yield Finding("keys", True if keys else None, f"{keys} live", "" if keys else "`isodyn keys create`")
+            beats = session.scalars(select(Worker.beat).where(Worker.state == "live")).all()
+            waiting = len(session.scalars(select(Job.id).where(Job.status == "accepted")).all())
+            fresh = [beat for beat in beats if (utc_now() - beat).total_seconds() < FRESH_BEAT_S]
+            seen = f"{len(fresh)} alive, {waiting} jobs waiting"
+            stuck = waiting > 0 and not fresh
+            yield Finding("workers", False if stuck else (True if fresh else None), seen,
+                          "" if fresh else "start `isodyn serve` or `isodyn worker`")  # fmt: skip
+    finally:
+        engine.dispose()
+
+
+def _blobs(settings: Settings) -> Iterator[Finding]:
+    from app.blobs import open_blob_store
+
+    if settings.blob_url is None and not settings.data_dir.exists():
+        return
+    store = open_blob_store(settings.resolved_blob_url)
+    probe = b"isodyn doctor"
+    ok = store.get(store.put(probe)) == probe
+    yield Finding("blob store", ok, settings.resolved_blob_url)
+
+
+def _port(settings: Settings) -> Iterator[Finding]:
+    with socket.socket() as probe:
+        taken = probe.connect_ex((settings.host, settings.port)) == 0
+    seen = f"{settings.host}:{settings.port} " + ("answers" if taken else "free")
+    yield Finding("port", None if taken else True, seen, "a server runs there already" if taken else "")

@@ -1,0 +1,84 @@
+"""A walk's samples as the observations a map is fitted from: averaged over short stretches of the path.
+
+Averaging loses nothing (a field hardly bends over 20 cm) and makes a phone that stands still for a minute one
+observation instead of three thousand: errors at one place are one error, not many.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import InvalidInput
+from app.field.samples import Components, Samples
+from app.geometry import Array
+
+__all__ = ["STRETCH_M", "Walk", "observe"]
+
+STRETCH_M = 0.2
+MIN_OBSERVATIONS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walk:
+    """The observations of one survey, in order of the walk.
+
+    position_m      (n, 3) mean position of each stretch, building frame
+    field_uT        (n, c) mean features of each stretch
+    path_m          (n,) distance walked
+    scatter_uT2     (c,) mean variance of single samples about the mean of their stretch
+    sample_count    samples the walk had
+    """
+
+    survey_id: str
+    position_m: Array
+    field_uT: Array
+    path_m: Array
+    scatter_uT2: Array
+    sample_count: int
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+
+def observe(walks: Mapping[str, Samples], components: Components, stretch_m: float = STRETCH_M) -> list[Walk]:
+    """The walks in order of survey id, each averaged over stretches of `stretch_m`.
+
+    Raises IncompatibleFrames when a walk cannot give the components, InvalidInput when there is too little to fit.
+    """
+    observed = [_average(name, walks[name], components, stretch_m) for name in sorted(walks) if len(walks[name])]
+    count = sum(len(walk) for walk in observed)
+    if count < MIN_OBSERVATIONS:
+        raise InvalidInput(
+            f"the surveys cover {count} distinct places {stretch_m:g} m apart; a map needs at least "
+            f"{MIN_OBSERVATIONS}: upload longer walks"
+        )
+    return observed
+
+
+def _average(survey_id: str, samples: Samples, components: Components, stretch_m: float) -> Walk:
+    field_uT, position = samples.features(components), samples.p_building_m
+    if not (np.isfinite(field_uT).all() and np.isfinite(position).all()):
+        raise InvalidInput(f"survey {survey_id} has samples that are not finite numbers: remove them and upload again")
+    starts = _stretch_starts(position, stretch_m)
+    counts = np.diff(np.append(starts, len(samples)))
+    position_m = np.add.reduceat(position, starts, axis=0) / counts[:, None]
+    mean = np.add.reduceat(field_uT, starts, axis=0) / counts[:, None]
+    deviation = field_uT - np.repeat(mean, counts, axis=0)
+    scatter = np.sum(np.square(deviation), axis=0) / max(len(samples) - len(starts), 1)
+    steps = np.linalg.norm(np.diff(position_m[:, :2], axis=0), axis=1)
+    path_m = np.concatenate([[0.0], np.cumsum(steps)])
+    return Walk(survey_id, position_m, mean, path_m, scatter, len(samples))
+
+
+def _stretch_starts(position_m: Array, stretch_m: float) -> NDArray[np.int64]:
+    """A new stretch begins where the walk is `stretch_m` away from where the present one began."""
+    limit = stretch_m**2
+    starts = [0]
+    x0, y0, z0 = position_m[0].tolist()
+    for index, (x, y, z) in enumerate(position_m.tolist()):
+        if (x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2 >= limit:
+            starts.append(index)
+            x0, y0, z0 = x, y, z
+    return np.asarray(starts, dtype=np.int64)

@@ -1,0 +1,103 @@
+"""Overlapping tiles on an absolute lattice of the building frame, and the partition of unity that blends them.
+
+Tile (i, j) of a lattice of pitch P has the core `[i P, (i + 1) P] x [j P, (j + 1) P]`, whatever the samples. It is
+fitted from samples within a margin of its core and answers within a smaller overlap; weights fall smoothly from 1 to 0
+across the overlap and sum to 1 everywhere.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.field.basis import CosineBasis
+from app.geometry import Array
+
+__all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "Lattice", "Tile"]
+
+PITCHES_M = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0)
+PITCH_IN_LENGTHS = 4.0
+MARGIN = 0.3
+OVERLAP = 0.1
+FUNCTIONS_PER_AXIS = 18
+
+
+class Tile(NamedTuple):
+    """Column and row of a tile; a lattice turns it into metres."""
+
+    column: int
+    row: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """The tiles of one pitch. Margin and overlap are fractions of the pitch on every side of a core."""
+
+    pitch_m: float
+    margin: float = MARGIN
+    overlap: float = OVERLAP
+    functions_per_axis: int = FUNCTIONS_PER_AXIS
+
+    @classmethod
+    def for_length(cls, length_m: float) -> "Lattice":
+        """The finest lattice whose pitch is at least four length scales: the box then spans six to nine."""
+        pitch = next((p for p in PITCHES_M if p >= PITCH_IN_LENGTHS * length_m), PITCHES_M[-1])
+        return cls(pitch)
+
+    def basis(self, tile: Tile) -> CosineBasis:
+        """The functions a tile is fitted with, on its core and margin."""
+        corner = tuple((index - self.margin) * self.pitch_m for index in tile)
+        side = (1.0 + 2.0 * self.margin) * self.pitch_m
+        return CosineBasis((corner[0], corner[1]), side, self.functions_per_axis)
+
+    def fitting(self, points_m: Array) -> dict[Tile, NDArray[np.int64]]:
+        """Tile -> indices, ascending, of the points (n, 2) it is fitted from."""
+        return self._members(points_m, self.margin)
+
+    def answering(self, points_m: Array) -> dict[Tile, NDArray[np.int64]]:
+        """Tile -> indices, ascending, of the points (n, 2) at which it has a weight."""
+        return self._members(points_m, self.overlap)
+
+    def answers_between(self, axis: int, tile: Tile) -> tuple[float, float]:
+        """The interval of x (axis 0) or y (axis 1) over which a tile has a weight."""
+        return (tile[axis] - self.overlap) * self.pitch_m, (tile[axis] + 1 + self.overlap) * self.pitch_m
+
+    def weight(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
+        """The tile's one-dimensional weight; a tile's weight at a point is the product over x and y."""
+        low, high = self._ramps(axis, tile, coordinate_m)
+        return np.asarray(_smooth_step(low) * _smooth_step(high))
+
+    def weight_slope(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
+        """Derivative of `weight`, per metre."""
+        low, high = self._ramps(axis, tile, coordinate_m)
+        width = 2.0 * self.overlap * self.pitch_m
+        rise = _smooth_step_slope(low) * _smooth_step(high) - _smooth_step(low) * _smooth_step_slope(high)
+        return np.asarray(rise / width)
+
+    def _ramps(self, axis: int, tile: Tile, coordinate_m: Array) -> tuple[Array, Array]:
+        start, stop = self.answers_between(axis, tile)
+        width = 2.0 * self.overlap * self.pitch_m
+        return np.clip((coordinate_m - start) / width, 0.0, 1.0), np.clip((stop - coordinate_m) / width, 0.0, 1.0)
+
+    def _members(self, points_m: Array, reach: float) -> dict[Tile, NDArray[np.int64]]:
+        scaled = points_m / self.pitch_m
+        home = np.floor(scaled).astype(np.int64)
+        members: dict[Tile, list[NDArray[np.int64]]] = {}
+        for step in np.ndindex(3, 3):
+            tile = home + np.asarray(step) - 1
+            near = np.flatnonzero(np.all((scaled >= tile - reach) & (scaled <= tile + 1 + reach), axis=1))
+            order = near[np.lexsort((near, tile[near, 1], tile[near, 0]))]
+            cuts = np.flatnonzero(np.any(np.diff(tile[order], axis=0), axis=1)) + 1
+            for group in np.split(order, cuts) if len(order) else []:
+                members.setdefault(Tile(int(tile[group[0], 0]), int(tile[group[0], 1])), []).append(group)
+        return {tile: np.sort(np.concatenate(members[tile])) for tile in sorted(members)}
+
+
+def _smooth_step(t: Array) -> Array:
+    """0 to 1 with two continuous derivatives; s(t) + s(1 - t) = 1."""
+    return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
+
+
+def _smooth_step_slope(t: Array) -> Array:
+    return np.asarray(30.0 * t**2 * (1.0 - t) ** 2)

@@ -1,0 +1,112 @@
+"""The composition root of the web process: settings in, one FastAPI application out."""
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from threading import Thread
+
+from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
+
+from app import __version__
+from app.api import buildings, health, jobs, locate, maps, surveys
+from app.api.body import BodyLimit
+from app.api.context import Context
+from app.api.metrics import Metrics, MetricsMiddleware
+from app.api.problems import Problem, add_problem_handlers
+from app.blobs import open_blob_store
+from app.db.engine import create_database_engine, migrate, session_factory
+from app.jobs.queue import JobQueue
+from app.positioning.locate import warm_up
+from app.services.grid_cache import GridCache
+from app.services.manage_keys import Identity, ensure_admin_key, recognise_key
+from app.settings import Settings
+from app.viewer.database_source import DatabaseViewerSource
+from app.viewer.page import ViewerApp
+
+__all__ = ["create_app", "first_start", "open_context"]
+
+DESCRIPTION = """Magnetic maps of buildings: upload walks, get a field map per floor, locate a window of
+magnetometer samples. Lengths are metres, field microtesla, angles radians, times UTC; every estimate says how sure it
+is. Errors are RFC 9457 problem documents."""
+
+
+def first_start(settings: Settings) -> str | None:
+    """Make the data folder, bring the database to today's schema and see to an admin key.
+
+    Returns the key when one was made that nobody has seen: show it, it is not kept.
+    """
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    engine = create_database_engine(settings.resolved_database_url)
+    migrate(engine)
+    with session_factory(engine).begin() as session:
+        made = ensure_admin_key(session, settings.admin_key)
+    engine.dispose()
+    return made
+
+
+def open_context(settings: Settings) -> Context:
+    """Open the database, the blob store and the job queue of a web process."""
+    engine = create_database_engine(settings.resolved_database_url)
+    blobs = open_blob_store(settings.resolved_blob_url)
+    return Context(
+        settings=settings,
+        engine=engine,
+        sessions=session_factory(engine),
+        blobs=blobs,
+        queue=JobQueue(engine),
+        grids=GridCache(blobs, settings.grid_cache_bytes),
+        metrics=Metrics(),
+    )
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The application. `first_start` must have run on these settings."""
+    settings = settings or Settings()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        Thread(target=warm_up, name="warm-up", daemon=True).start()
+        yield
+        await viewer.close()
+        await run_in_threadpool(context.queue.close)
+        context.engine.dispose()
+
+    context = open_context(settings)
+    viewer = ViewerApp(_authenticator(context), DatabaseViewerSource(context.sessions, context.blobs))
+    app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
+                  redirect_slashes=False)  # fmt: skip
+    app.state.context = context
+    for part in (health, buildings, surveys, maps, locate, jobs):
+        app.include_router(part.router)
+    app.mount("/view", viewer)
+    add_problem_handlers(app)
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, streams_itself=_is_upload)
+    app.add_middleware(MetricsMiddleware, metrics=context.metrics)
+    _describe_problems(app)
+    return app
+
+
+def _is_upload(path: str) -> bool:
+    return path.startswith("/v1/floors/") and path.endswith("/surveys")
+
+
+def _authenticator(context: Context) -> Callable[[str], Identity | None]:
+    def authenticate(key: str) -> Identity | None:
+        with context.sessions() as session:
+            return recognise_key(session, key)
+
+    return authenticate
+
+
+def _describe_problems(app: FastAPI) -> None:
+    """Put the problem document into the OpenAPI schema, which refers to it from every operation."""
+    make = app.openapi
+
+    def openapi() -> dict[str, object]:
+        schema = make()
+        problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        definitions = problem.pop("$defs")
+        schema["components"]["schemas"].update({"Problem": problem, **definitions})
+        return schema
+
+    app.openapi = openapi  # type: ignore[method-assign]

@@ -1,0 +1,162 @@
+"""Build the map of a floor from its surveys: claim what to build, fit it, publish it.
+
+A worker calls the three in this order; each may run twice (a worker may die after the work and before the note of
+it), so each is idempotent. Claiming draws the floor's next `build_sequence`; publishing moves the floor's pointer
+only if nothing newer was published, so builds that overtake each other cannot bring an old map back.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import Any, cast
+
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from app.blobs import BlobStore
+from app.db.tables import Floor, Job, Map, Survey
+from app.errors import InvalidInput, NotFound
+from app.field.fit import fit_map
+from app.field.samples import SampleFrame, richest_components
+from app.field.spec import FittedMap, MapSpec
+from app.services.artefacts import grid_to_bytes, samples_from_bytes
+
+__all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "publish_build"]
+
+Plan = dict[str, Any]
+Result = dict[str, Any]
+
+
+def claim_build(session: Session, job_id: str) -> Plan:
+    """Mark the job running and fix what it builds: the surveys included now, the parameters, its place in order."""
+    job = _job(session, job_id)
+    now = datetime.now(UTC)
+    map_row = session.get(Map, job.map_id) if job.map_id else None
+    if map_row is None:  # a rebuild makes its map row when it starts
+        map_row = Map(organisation_id=job.organisation_id, floor_id=job.floor_id, status="running", spec={},
+                      survey_ids=[], created_at=now)  # fmt: skip
+        session.add(map_row)
+        session.flush()
+        job.map_id = map_row.id
+    if map_row.sequence == 0:
+        map_row.sequence = cast(
+            int,
+            session.execute(
+                update(Floor)
+                .where(Floor.id == job.floor_id)
+                .values(build_sequence=Floor.build_sequence + 1)
+                .returning(Floor.build_sequence)
+            ).scalar_one(),
+        )
+        map_row.survey_ids = _wanted_surveys(session, job.floor_id, map_row)
+    map_row.status = job.status = "running"
+    job.started_at = job.started_at or now
+    job.message = f"fitting {len(map_row.survey_ids)} surveys"
+    surveys = session.execute(
+        select(Survey.id, Survey.samples_sha256, Survey.frame).where(Survey.id.in_(map_row.survey_ids))
+    ).all()
+    return {
+        "map_id": map_row.id,
+        "floor_id": job.floor_id,
+        "sequence": map_row.sequence,
+        "spec": map_row.spec,
+        "surveys": sorted([row.id, row.samples_sha256, row.frame] for row in surveys),
+    }
+
+
+def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
+    """Fit the map of a plan and store its grid and quality reports as blobs. No database; may take minutes.
+
+    Raises InvalidInput (nothing to fit, frames that cannot give the components asked for), JobCancelled (through
+    `progress`).
+    """
+    surveys: list[tuple[str, str, SampleFrame]] = [(i, sha, frame) for i, sha, frame in plan["surveys"]]
+    if not surveys:
+        raise InvalidInput("the floor has no included survey left to build a map from; upload or include one")
+    progress(0.0, f"reading {len(surveys)} surveys")
+    walks = {survey_id: samples_from_bytes(blobs.get(sha)) for survey_id, sha, _ in surveys}
+    parameters = dict(plan["spec"])
+    parameters.setdefault("components", richest_components({frame for _, _, frame in surveys}))
+    if parameters.get("heights_m"):
+        parameters["heights_m"] = tuple(parameters["heights_m"])
+    fitted = fit_map(walks, MapSpec(**parameters), lambda f, message: progress(0.02 + 0.93 * f, message))
+    progress(0.96, "storing the grid")
+    return {
+        "grid_sha256": blobs.put(grid_to_bytes(fitted.grid)),
+        "quality_sha256": blobs.put(_quality_bytes(fitted)),
+        "components": fitted.grid.components,
+        "bounds_m": list(fitted.grid.bounds_m),
+        "hyperparameters": fitted.hyperparameters,
+        "score": asdict(fitted.score) if fitted.score else None,
+        "score_reason": fitted.score_reason,
+    }
+
+
+def publish_build(session: Session, job_id: str, plan: Plan, result: Result) -> None:
+    """Make the map ready, move the floor's pointer to it unless a newer one is there, and end the job."""
+    job = _job(session, job_id)
+    map_row = session.get_one(Map, plan["map_id"])
+    for name in ("grid_sha256", "quality_sha256", "components", "bounds_m", "hyperparameters", "score", "score_reason"):
+        setattr(map_row, name, result[name])
+    map_row.status, map_row.finished_at = "ready", datetime.now(UTC)
+    activated = map_row.activate and session.execute(
+        update(Floor)
+        .where(Floor.id == plan["floor_id"], Floor.active_sequence < plan["sequence"])
+        .values(active_map_id=map_row.id, active_sequence=plan["sequence"])
+        .returning(Floor.id)
+    ).first() is not None  # fmt: skip
+    _end(job, "successful", "the map is ready" + (" and active" if activated else ""))
+    job.progress = 100
+    job.result = {"map_id": map_row.id, "sha256": map_row.grid_sha256, "activated": activated}
+
+
+def fail_build(session: Session, job_id: str, message: str) -> None:
+    """End the job and its map as failed, with a message a person can act on."""
+    _end_unfinished(session, job_id, "failed", message)
+
+
+def dismiss_build(session: Session, job_id: str) -> None:
+    """End the job and its map as cancelled."""
+    _end_unfinished(session, job_id, "dismissed", "cancelled")
+
+
+def _end_unfinished(session: Session, job_id: str, status: str, message: str) -> None:
+    job = _job(session, job_id)
+    if job.status in ("successful", "failed", "dismissed"):
+        return
+    _end(job, status, message)
+    map_row = session.get(Map, job.map_id) if job.map_id else None
+    if map_row is not None:
+        map_row.status, map_row.finished_at = status, datetime.now(UTC)
+
+
+def _end(job: Job, status: str, message: str) -> None:
+    job.status, job.message, job.finished_at = status, message, datetime.now(UTC)
+
+
+def _job(session: Session, job_id: str) -> Job:
+    job = session.get(Job, job_id, with_for_update=True)
+    if job is None:
+        raise NotFound(f"no job {job_id}")
+    return job
+
+
+def _wanted_surveys(session: Session, floor_id: str, map_row: Map) -> list[str]:
+    """The surveys asked for that still exist, or every included one."""
+    wanted = select(Survey.id).where(Survey.floor_id == floor_id).order_by(Survey.id)
+    wanted = wanted.where(Survey.id.in_(map_row.survey_ids)) if map_row.survey_ids else wanted.where(Survey.included)
+    return list(session.scalars(wanted))
+
+
+def _quality_bytes(fitted: FittedMap) -> bytes:
+    quality: Mapping[str, Any] = {
+        "score": asdict(fitted.score) if fitted.score else None,
+        "score_reason": fitted.score_reason,
+        "components": fitted.grid.component_names,
+        "measured_area_m2": float(fitted.grid.measured.any(axis=0).sum()) * fitted.grid.resolution_m**2,
+        "noise_sd_ut": [float(sd) for sd in fitted.grid.noise_sd_uT],
+        "error_correlation_m": fitted.grid.error_correlation_m,
+        "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
+    }
+    return json.dumps(quality, sort_keys=True, allow_nan=False).encode()

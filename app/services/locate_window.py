@@ -1,0 +1,73 @@
+"""Locate a window: the active maps of the candidate floors (one statement), the search, the fix. Nothing is written."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db.tables import Floor, Map
+from app.errors import NotFound
+from app.positioning.fix import Fix, LocateOptions, Prior
+from app.positioning.locate import locate
+from app.positioning.window import Composition, Window
+from app.services.grid_cache import GridCache
+
+__all__ = ["ActiveMap", "LocateResult", "active_maps", "locate_window"]
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveMap:
+    """The map a floor answers with now."""
+
+    floor_id: str
+    map_id: str
+    grid_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class LocateResult:
+    """A fix, the maps it was found in, and the time the search took."""
+
+    fix: Fix
+    map_ids: tuple[str, ...]
+    search_ms: float
+
+
+def active_maps(
+    session: Session, organisation_id: str, *, building_id: str | None = None, floor_ids: Sequence[str] | None = None
+) -> list[ActiveMap]:
+    """The active maps of a building's floors, or of the floors named. Raises NotFound for a floor (or a building
+    without floors) that does not exist here; a floor without a map is simply not among them."""
+    statement = (
+        select(Floor.id, Map.id, Map.grid_sha256)
+        .join(Map, Map.id == Floor.active_map_id, isouter=True)
+        .where(Floor.organisation_id == organisation_id)
+        .order_by(Floor.ordinal, Floor.id)
+    )
+    if building_id is not None:
+        statement = statement.where(Floor.building_id == building_id)
+    if floor_ids is not None:
+        statement = statement.where(Floor.id.in_(floor_ids))
+    rows = session.execute(statement).all()
+    for missing in sorted(set(floor_ids or ()) - {row[0] for row in rows}):
+        raise NotFound(f"no floor {missing}" + (" in this building" if building_id else ""))
+    return [ActiveMap(*row) for row in rows if row[1] is not None]
+
+
+def locate_window(
+    maps: Sequence[ActiveMap],
+    cache: GridCache,
+    window: Window,
+    *,
+    composition: Composition,
+    techniques: Sequence[str],
+    prior: Prior | None,
+    options: LocateOptions,
+) -> LocateResult:
+    """Match a window against maps. Raises InvalidWindow, IncompatibleFrames."""
+    floors = [cache.searchable(each.floor_id, each.grid_sha256) for each in maps]
+    start = perf_counter()
+    fix = locate(window, floors, composition=composition, techniques=techniques, prior=prior, options=options)
+    return LocateResult(fix, tuple(each.map_id for each in maps), 1e3 * (perf_counter() - start))
