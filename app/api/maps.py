@@ -229,7 +229,7 @@ def get_quality(map_id: Id, request: Request, context: ContextDep, identity: Rea
     "/maps/{map_id}/export",
     summary="The map as a file",
     response_class=Response,
-    responses={200: {"content": {media: _BINARY for media in MEDIA_TYPES.values()}}},
+    responses={200: {"content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)}},
 )
 def get_export(
     map_id: Id, request: Request, context: ContextDep, identity: Reading, format: Annotated[ExportFormat, Query()]
