@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -16,18 +17,14 @@ def read_csv(data: bytes, frame: SampleFrame) -> Columns:
     """The columns of a CSV file. Raises UnreadableSurvey with line and column, TooLarge."""
     text = decode_utf8(data)
     check_sample_count(max(data.count(b"\n"), data.count(b"\r")))
-    header, body = _header(text)
+    first, header = _header(text)
     wanted = columns_to_read(header, frame)
-    columns = _read_fast(data, header, wanted)
-    if columns is None:
-        columns = _read_slowly(body, header, wanted)
-    return columns
+    columns = _read_fast(text, first, header, wanted)
+    return columns if columns is not None else _read_slowly(text, header, wanted)
 
 
 def decode_utf8(data: bytes) -> str:
     """Text without byte-order mark. Raises UnreadableSurvey for anything that is no UTF-8 text, or empty."""
-    if not data.strip():
-        raise UnreadableSurvey("the file is empty", Fault("file", "0 bytes of text"))
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -41,33 +38,42 @@ def decode_utf8(data: bytes) -> str:
         raise UnreadableSurvey(
             f"the file is not text: line {line} holds a zero byte", Fault(f"line {line}", "a zero byte")
         )
+    if not text.strip():
+        raise UnreadableSurvey("the file is empty", Fault("file", "no text"))
     return text
 
 
-def _header(text: str) -> tuple[list[str], list[tuple[int, str]]]:
-    """The column names, and the lines of the body that are not blank, each with its number from 1."""
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    names = [name.strip().strip('"').strip() for name in lines[0][1].split(",")]
+def _lines(text: str) -> Iterator[tuple[int, str]]:
+    """The lines that are not blank, each with its number from 1."""
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return ((number, line) for number, line in enumerate(lines, start=1) if line.strip())
+
+
+def _header(text: str) -> tuple[int, list[str]]:
+    """The number of the header's line, and the column names on it."""
+    number, line = next(_lines(text))
+    names = [name.strip().strip('"').strip() for name in line.split(",")]
     twice = sorted({name for name in names if names.count(name) > 1 and name})
     if twice:
         raise UnreadableSurvey(
-            f"the header names {twice[0][:40]} twice; name each column once", Fault("line 1", f"{twice[0][:40]} twice")
+            f"the header names {twice[0][:40]} twice; name each column once",
+            Fault(f"line {number}", f"{twice[0][:40]} twice"),
         )
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(names) == 1 and separator in names[0]:
-            raise UnreadableSurvey(f"the columns are separated by {name}; use commas", Fault("line 1", name))
-    return names, lines[1:]
+            raise UnreadableSurvey(f"the columns are separated by {name}; use commas", Fault(f"line {number}", name))
+    return number, names
 
 
-def _read_fast(data: bytes, header: list[str], wanted: tuple[str, ...]) -> Columns | None:
+def _read_fast(text: str, first: int, header: list[str], wanted: tuple[str, ...]) -> Columns | None:
     """Arrow's reading, or None where it would refuse or would guess."""
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
     try:
         table = arrow_csv.read_csv(
-            pa.BufferReader(data.removeprefix(b"\xef\xbb\xbf")),
-            read_options=arrow_csv.ReadOptions(use_threads=False, column_names=header, skip_rows=1),
+            pa.BufferReader(text.encode()),
+            read_options=arrow_csv.ReadOptions(use_threads=False, column_names=header, skip_rows=first),
             parse_options=arrow_csv.ParseOptions(quote_char=False),
             convert_options=arrow_csv.ConvertOptions(
                 column_types=dict.fromkeys(wanted, pa.float64()), include_columns=list(wanted), null_values=[]
@@ -76,11 +82,12 @@ def _read_fast(data: bytes, header: list[str], wanted: tuple[str, ...]) -> Colum
     except (pa.ArrowException, ValueError):
         return None
     values = {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in wanted}
-    return Columns(values, _LineNumbers(data))
+    return Columns(values, _LineNumbers(text))
 
 
-def _read_slowly(body: list[tuple[int, str]], header: list[str], wanted: tuple[str, ...]) -> Columns:
+def _read_slowly(text: str, header: list[str], wanted: tuple[str, ...]) -> Columns:
     """Line by line. Raises UnreadableSurvey with every faulty cell up to the limit."""
+    body = list(_lines(text))[1:]
     places = [(header.index(name), name) for name in wanted]
     rows: list[list[float]] = []
     faults: list[Fault] = []
@@ -118,12 +125,11 @@ def _number(cell: str) -> float | None:
 class _LineNumbers:
     """Where row i of the body stands, counting lines only when somebody asks."""
 
-    def __init__(self, data: bytes) -> None:
-        self._data = data
+    def __init__(self, text: str) -> None:
+        self._text = text
         self._numbers: list[int] | None = None
 
     def __call__(self, row: int) -> str:
         if self._numbers is None:
-            lines = enumerate(self._data.splitlines(), start=1)
-            self._numbers = [number for number, line in lines if line.strip()][1:]
+            self._numbers = [number for number, _ in _lines(self._text)][1:]
         return f"line {self._numbers[row]}" if row < len(self._numbers) else f"row {row + 1}"

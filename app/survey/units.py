@@ -44,19 +44,29 @@ def field_faults(norm_uT: Array, location: Callable[[int], str]) -> tuple[str | 
     guess = guess_unit(typical)
     if guess:
         worst = int(outside[0]) if len(outside) else int(np.argmax(norm_uT))
-        message = f"the field is not in microtesla: a median |B| of {typical:,.4g} looks like {guess}"
+        message = f"the field is not in microtesla: a median |B| of {_figure(typical)} looks like {guess}"
         if typical >= PLAUSIBLE_MEDIAN_UT[1] and typical <= MAX_FIELD_UT:
             message += "; if it is microtesla, the sensor's hard iron was not removed: subtract its bias"
         reading = float(norm_uT[worst])
-        return message, [Fault(location(worst), f"|B| of {reading:,.6g} looks like {guess_unit(reading) or guess}")]
+        return message, [
+            Fault(location(worst), f"a reading of {_figure(reading)} looks like {guess_unit(reading) or guess}")
+        ]
     if not len(outside):
         return None, []
-    faults = [
-        Fault(location(int(i)), f"|B| of {norm_uT[i]:,.6g} uT is outside {MIN_FIELD_UT:.0f}-{MAX_FIELD_UT:,.0f} uT")
-        for i in outside[:20]
-    ]
+    faults = [Fault(location(int(i)), _single(float(norm_uT[i]))) for i in outside[:20]]
     return (
         f"{len(outside)} of {len(norm_uT)} readings of the field are outside {MIN_FIELD_UT:.0f}-{MAX_FIELD_UT:,.0f} uT "
         f"({faults[0].location}); the field has to be in microtesla, and saturated readings removed",
         faults,
     )
+
+
+def _single(reading: float) -> str:
+    """Why one reading among good ones is refused."""
+    reason = f"|B| of {_figure(reading)} uT is outside {MIN_FIELD_UT:.0f}-{MAX_FIELD_UT:,.0f} uT"
+    guess = guess_unit(reading) if reading > MAX_FIELD_UT else None
+    return f"{reason}; it looks like {guess}" if guess else reason
+
+
+def _figure(x: float) -> str:
+    return f"{x:,.0f}" if x >= 1000.0 else f"{x:.4g}"
