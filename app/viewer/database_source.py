@@ -1,0 +1,88 @@
+"""The viewer's source on the real storage: rows by SQLAlchemy, grids and samples by their hash in the blob store."""
+
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.blobs import BlobStore
+from app.db.tables import Building, Floor, Map, Survey
+from app.errors import NotFound
+from app.field.grid import FieldGrid
+from app.geometry import Array
+from app.services.artefacts import grid_from_bytes, samples_from_bytes
+from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
+
+__all__ = ["DatabaseViewerSource", "rings_of_polygon"]
+
+
+class DatabaseViewerSource:
+    """A `ViewerSource`: every statement asks for the organisation's own rows."""
+
+    def __init__(self, sessions: sessionmaker[Session], blobs: BlobStore) -> None:
+        self._sessions = sessions
+        self._blobs = blobs
+
+    def buildings(self, organisation_id: str) -> list[ViewedBuilding]:
+        """Every building by name with its floors from the lowest, in two statements."""
+        floors_of: dict[str, list[ViewedFloor]] = {}
+        with self._sessions() as session:
+            rows = session.execute(
+                select(Floor, Map.grid_sha256)
+                .outerjoin(Map, (Map.id == Floor.active_map_id) & (Map.status == "ready"))
+                .where(Floor.organisation_id == organisation_id)
+                .order_by(Floor.ordinal, Floor.id)
+            )
+            for floor, grid_sha256 in rows:
+                floors_of.setdefault(floor.building_id, []).append(_viewed(floor, grid_sha256))
+            buildings = session.scalars(
+                select(Building).where(Building.organisation_id == organisation_id).order_by(Building.name, Building.id)
+            )
+            return [ViewedBuilding(b.id, b.name, tuple(floors_of.get(b.id, ()))) for b in buildings]
+
+    def grid(self, organisation_id: str, map_id: str) -> FieldGrid:
+        """The grid of a map. Raises NotFound, CorruptArtefact."""
+        with self._sessions() as session:
+            sha256 = session.scalars(
+                select(Map.grid_sha256).where(Map.id == map_id, Map.organisation_id == organisation_id)
+            ).one_or_none()
+        if sha256 is None:
+            raise NotFound(f"no map {map_id} that is ready; `GET /v1/maps/{map_id}` says how it stands")
+        return grid_from_bytes(self._blobs.get(sha256))
+
+    def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
+        """The included surveys of a floor in order of arrival. Raises NotFound, CorruptArtefact."""
+        with self._sessions() as session:
+            floor = session.get(Floor, floor_id)
+            if floor is None or floor.organisation_id != organisation_id:
+                raise NotFound(f"no floor {floor_id}; `GET /v1/buildings` shows what there is")
+            rows = session.execute(
+                select(Survey.id, Survey.name, Survey.samples_sha256)
+                .where(Survey.floor_id == floor_id, Survey.included)
+                .order_by(Survey.id)
+            ).all()
+        return [self._walk(*row) for row in rows]
+
+    def _walk(self, survey_id: str, name: str, samples_sha256: str) -> Walk:
+        samples = samples_from_bytes(self._blobs.get(samples_sha256))
+        return Walk(survey_id, name, samples.p_building_m, samples.B_uT)
+
+
+def _viewed(floor: Floor, grid_sha256: str | None) -> ViewedFloor:
+    return ViewedFloor(
+        id=floor.id,
+        name=floor.name,
+        ordinal=floor.ordinal,
+        elevation_m=floor.elevation_m,
+        rings_m=rings_of_polygon(floor.outline),
+        map_id=floor.active_map_id if grid_sha256 is not None else None,
+        grid_sha256=grid_sha256,
+    )
+
+
+def rings_of_polygon(outline: dict[str, Any] | None) -> tuple[Array, ...]:
+    """The rings (k, 2) of a GeoJSON Polygon in building metres; () for None."""
+    if outline is None:
+        return ()
+    return tuple(np.asarray(ring, dtype=np.float64)[:, :2] for ring in outline["coordinates"])

@@ -1,0 +1,115 @@
+"""Layers of a map as arrays and colours: one layer at one height, with its unit and a colour-blind-safe colour map."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import InvalidInput
+from app.field.grid import FieldGrid
+from app.field.samples import COMPONENT_NAMES, Components
+from app.geometry import Array
+
+__all__ = ["LAYERS", "ColourScale", "Layer", "colour_scale", "layer_names", "layer_values", "legend_html"]
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """How a layer is named, in which unit it is, and which of matplotlib's colour maps shows it."""
+
+    title: str
+    unit: str
+    colour_map: str = "viridis"
+
+
+LAYERS: dict[str, Layer] = {
+    "norm": Layer("Magnitude |B|", "µT"),
+    "bx": Layer("Component Bx (along the plan's x)", "µT"),
+    "by": Layer("Component By (along the plan's y)", "µT"),
+    "bz": Layer("Component Bz (up)", "µT"),
+    "horizontal": Layer("Horizontal magnitude", "µT"),
+    "vertical": Layer("Vertical component (up)", "µT"),
+    "sd": Layer("Uncertainty (1 sd, all components)", "µT", "cividis"),
+    "gradient": Layer("Gradient along the floor", "µT/m"),
+    "measured": Layer("Measured cells", "", "cividis"),
+}
+
+
+def layer_names(components: Components) -> tuple[str, ...]:
+    """The layers a map of these components has."""
+    own = () if components == "norm" else COMPONENT_NAMES[components]
+    return ("norm", *own, "sd", "gradient", "measured")
+
+
+def layer_values(grid: FieldGrid, layer: str, height_index: int = 0) -> Array:
+    """One layer at one height: (ny, nx), NaN where nothing was measured ("measured" itself: 1 and 0, never NaN).
+
+    norm is the magnitude of the mean field; sd the root of the summed variances of the components; gradient the
+    Frobenius norm of the derivative with x and y. Raises InvalidInput naming the layers, or heights, of this map.
+    """
+    known = layer_names(grid.components)
+    if layer not in known:
+        raise InvalidInput(f"this {grid.components} map has no layer {layer!r}; ask for one of {', '.join(known)}")
+    if not 0 <= height_index < len(grid.heights_m):
+        heights = ", ".join(f"{k}: {z:.2f} m" for k, z in enumerate(grid.heights_m))
+        raise InvalidInput(f"this map has no height {height_index}; its heights are {heights}")
+    measured = grid.measured[height_index]
+    if layer == "measured":
+        return np.asarray(measured.astype(np.float64))
+    return np.asarray(np.where(measured, _raw_values(grid, layer, height_index), np.nan))
+
+
+def _raw_values(grid: FieldGrid, layer: str, k: int) -> Array:
+    if layer == "norm":
+        return np.asarray(np.linalg.norm(grid.mean_uT[k].astype(np.float64), axis=-1))
+    if layer == "sd":
+        return np.asarray(np.linalg.norm(grid.sd_uT[k].astype(np.float64), axis=-1))
+    if layer == "gradient":
+        return np.asarray(np.sqrt(np.square(grid.gradient_uT_per_m[k], dtype=np.float64).sum(axis=(-2, -1))))
+    return np.asarray(grid.mean_uT[k, ..., grid.component_names.index(layer)].astype(np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class ColourScale:
+    """Values from `low` to `high` spread over a colour map; what lies outside takes the end colours."""
+
+    low: float
+    high: float
+    colour_map: str = "viridis"
+
+    def rgb(self, values: Array) -> NDArray[np.uint8]:
+        """sRGB colours (..., 3) of values (...). NaN takes the lowest colour: leave such cells out before."""
+        from matplotlib import colormaps  # here, because half a second of import belongs to the first picture only
+
+        unit = np.clip((np.nan_to_num(values, nan=self.low) - self.low) / (self.high - self.low), 0.0, 1.0)
+        return np.asarray(colormaps[self.colour_map](unit, bytes=True))[..., :3]
+
+
+def colour_scale(layer: str, values: Iterable[Array]) -> ColourScale:
+    """One scale for several floors: the 1st to the 99th percentile of every value that is not NaN."""
+    seen = np.concatenate([np.zeros(0), *(v[np.isfinite(v)] for v in values)])
+    if layer == "measured" or len(seen) == 0:
+        return ColourScale(0.0, 1.0, LAYERS[layer].colour_map)
+    low, high = (float(q) for q in np.percentile(seen, [1.0, 99.0]))
+    if high - low < 1e-6 * max(1.0, abs(high)):
+        low, high = low - 0.5, high + 0.5
+    return ColourScale(low, high, LAYERS[layer].colour_map)
+
+
+def legend_html(layer: str, scale: ColourScale) -> str:
+    """A legend as self-contained HTML: title, colour bar, five values and the unit, readable without seeing colours."""
+    stops = scale.rgb(np.linspace(scale.low, scale.high, 12))
+    gradient = ", ".join(f"rgb({r},{g},{b})" for r, g, b in stops)
+    decimals = int(np.clip(2 - np.floor(np.log10(scale.high - scale.low)), 0, 3))
+    ticks = "".join(f"<span>{value:.{decimals}f}</span>" for value in np.linspace(scale.low, scale.high, 5))
+    about = LAYERS[layer]
+    label = f"{about.title}, {about.unit}" if about.unit else about.title
+    return (
+        f'<div role="img" aria-label="{escape(label)}: from {scale.low:.{decimals}f} to {scale.high:.{decimals}f}">'
+        f'<div style="font-size:0.85em;margin-bottom:0.3em">{escape(label)}</div>'
+        f'<div style="height:0.9em;border-radius:0.2em;background:linear-gradient(to right, {gradient})"></div>'
+        f'<div style="display:flex;justify-content:space-between;font-size:0.75em;margin-top:0.2em;'
+        f'font-variant-numeric:tabular-nums">{ticks}</div></div>'
+    )

@@ -1,0 +1,155 @@
+"""Between a signed-in browser and its organisation's viser server: the page over HTTP, messages over WebSocket.
+
+viser trusts whoever connects. Here only messages this page needs pass towards it; the rest (asking for a public share
+address, uploads, answers to questions nobody asked) is dropped. Cookies never travel on. The page is served with a
+policy that lets it talk to its own origin only, because viser's client would connect to any address in its URL.
+"""
+
+import asyncio
+import contextlib
+import gzip
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import httpx
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.typing import Subprotocol
+
+__all__ = ["CLOSE_SIGNED_OUT", "CLOSE_UNREACHABLE", "PAGE_POLICY", "ViserPage", "fetch_page", "passes", "relay"]
+
+CLOSE_SIGNED_OUT = 4401
+CLOSE_UNREACHABLE = 1011
+_MOST_MESSAGE_BYTES = 64 * 2**10  # of a message from the browser: a camera or a control is far smaller
+_MOST_SCENE_BYTES = 64 * 2**20
+
+# What the page's own controls send. A new kind of control needs its message here.
+_PASSING = frozenset({"ViewerCameraMessage", "GuiUpdateMessage"})
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src data:; connect-src 'self' data: blob:; worker-src blob: data:; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+
+_OVERLAY = """
+<style>.isodyn-bar{position:fixed;left:1rem;bottom:1rem;z-index:10}
+.isodyn-bar button{font:13px system-ui,sans-serif;padding:.4rem .8rem;border-radius:.4rem;cursor:pointer;
+border:1px solid #495057;background:rgba(26,27,30,.85);color:#e9ecef}
+.isodyn-bar button:focus-visible{outline:2px solid #74c0fc;outline-offset:2px}</style>
+<form class="isodyn-bar" method="post" action="PREFIX/sign-out"><button>Sign out</button></form>
+<script>
+(() => {
+  const look = () => fetch("PREFIX/session", {cache: "no-store"})
+    .then((answer) => { if (answer.status === 401) location.reload(); }).catch(() => {});
+  setInterval(look, 60000);
+  document.addEventListener("visibilitychange", () => { if (!document.hidden) look(); });
+})();
+</script>
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class ViserPage:
+    """viser's single page, made ours: its bytes, plain and compressed, and their tag."""
+
+    html: bytes
+    gzipped: bytes
+    etag: str
+
+
+async def fetch_page(http_url: str, prefix: str) -> ViserPage:
+    """Fetch viser's page from its server and give it our title, a way to sign out, and an eye on the session."""
+    async with httpx.AsyncClient(trust_env=False) as client:
+        answer = await client.get(http_url, headers={"Accept-Encoding": "identity"})
+        answer.raise_for_status()
+    page = answer.text.replace("<title>Viser</title>", "<title>Isodyn</title>", 1)
+    html = page.replace('<div id="root"></div>', f'<div id="root"></div>{_OVERLAY.replace("PREFIX", prefix)}', 1)
+    data = html.encode()
+    return ViserPage(data, gzip.compress(data, 6, mtime=0), f'"{hashlib.sha256(data).hexdigest()[:32]}"')
+
+
+def passes(message: bytes) -> bool:
+    """Whether a browser's message may go on to viser: small, readable, of a kind the page's controls send."""
+    if len(message) > _MOST_MESSAGE_BYTES:
+        return False
+    try:
+        decoded = msgspec.msgpack.decode(message)
+    except (msgspec.DecodeError, RecursionError):
+        return False
+    if not isinstance(decoded, dict) or decoded.get("type") not in _PASSING:
+        return False
+    if decoded["type"] == "GuiUpdateMessage":  # viser would set any attribute named here
+        return isinstance(decoded.get("updates"), dict) and set(decoded["updates"]) <= {"value"}
+    return True
+
+
+async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[None]) -> None:
+    """Accept a browser and pass messages both ways until either side closes or `ended` is done (signed out).
+
+    Sending waits for the receiver, so a slow browser slows its own stream only.
+    """
+    offered = [Subprotocol(p) for p in browser.scope.get("subprotocols", ()) if p.startswith("viser-v")]
+    try:
+        upstream = await _connect(upstream_url, offered)
+    except (OSError, WebSocketException, TimeoutError):
+        await browser.accept()
+        await browser.close(CLOSE_UNREACHABLE, "the viewer is not running; load the page again")
+        return
+    async with upstream:
+        await browser.accept(subprotocol=upstream.subprotocol)
+        towards_viser = asyncio.create_task(_towards_viser(browser, upstream))
+        towards_browser = asyncio.create_task(_towards_browser(upstream, browser))
+        flows = (towards_viser, towards_browser)
+        try:
+            await asyncio.wait([*flows, ended], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in flows:
+                task.cancel()
+            await asyncio.gather(*flows, return_exceptions=True)
+        await _close_browser(browser, upstream, signed_out=ended.done())
+
+
+async def _connect(url: str, subprotocols: Sequence[Subprotocol]) -> ClientConnection:
+    return await connect(
+        url,
+        subprotocols=subprotocols or None,
+        compression=None,
+        max_size=_MOST_SCENE_BYTES,
+        proxy=None,  # never by a proxy from the environment: this is loopback
+        user_agent_header=None,
+        open_timeout=5,
+        close_timeout=2,
+    )
+
+
+async def _towards_viser(browser: WebSocket, upstream: ClientConnection) -> None:
+    with contextlib.suppress(WebSocketDisconnect, ConnectionClosed):
+        while True:
+            message = await browser.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            data = message.get("bytes")
+            if data is not None and passes(data):
+                await upstream.send(data)
+
+
+async def _towards_browser(upstream: ClientConnection, browser: WebSocket) -> None:
+    with contextlib.suppress(WebSocketDisconnect, ConnectionClosed):
+        async for message in upstream:
+            if isinstance(message, bytes):
+                await browser.send_bytes(message)
+
+
+async def _close_browser(browser: WebSocket, upstream: ClientConnection, signed_out: bool) -> None:
+    code, reason = 1000, ""
+    if signed_out:
+        code, reason = CLOSE_SIGNED_OUT, "signed out"
+    elif upstream.close_code is not None:
+        sendable = upstream.close_code in (1000, 1001, 1002, 1003, 1007, 1008, 1009, 1011)
+        code, reason = (upstream.close_code if sendable else CLOSE_UNREACHABLE), upstream.close_reason or ""
+    with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it may have gone already
+        await browser.close(code, reason)

@@ -1,0 +1,247 @@
+"""A map and its walks as things to draw: plain arrays first (pure functions), then nodes of a viser scene.
+
+Everything is float32 about a local origin subtracted in double precision, because viser sends coordinates in single
+precision at best. A layer is drawn as a textured plane: its colours are exactly the legend's (lit or tone-mapped
+meshes are not), its unmeasured cells are transparent, and a floor costs kilobytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from app.field.grid import FieldGrid
+from app.geometry import Array
+from app.viewer.layers import ColourScale
+from app.viewer.source import Walk
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from viser import ArrowsHandle, ImageHandle, LineSegmentsHandle, SceneApi
+
+__all__ = [
+    "MAX_ARROWS",
+    "MAX_POINTS",
+    "WALK_COLOURS",
+    "Arrows",
+    "Surface",
+    "camera_pose",
+    "draw_arrows",
+    "draw_ground",
+    "draw_lines",
+    "draw_surface",
+    "field_arrows",
+    "ground_cell_m",
+    "local_origin_m",
+    "ring_segments",
+    "suggested_arrow_spacing_m",
+    "suggested_separation_m",
+    "surface",
+    "walk_segments",
+]
+
+MAX_POINTS = 300_000
+MAX_ARROWS = 20_000
+_MAX_WALK_SEGMENTS = 60_000
+_USUAL_ARROWS = 320
+_CLEARANCE_M = 0.04  # lifts lines and arrows off the plane they would otherwise flicker against
+
+# Okabe and Ito's colours that stand out from viridis: distinguishable with every common colour vision.
+WALK_COLOURS = ((255, 255, 255), (230, 159, 0), (213, 94, 0), (204, 121, 167), (86, 180, 233))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A layer as a picture lying in the plane: rgba (ny, nx, 4), row j towards +y; centre and size in local metres."""
+
+    rgba: NDArray[np.uint8]
+    centre_m: tuple[float, float, float]
+    size_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrows:
+    """Field arrows: ends (n, 2, 3) float32 local metres, magnitude_uT (n,), and the spacing they were thinned to."""
+
+    ends_m: NDArray[np.float32]
+    magnitude_uT: Array
+    spacing_m: float
+
+
+def local_origin_m(grids: Sequence[FieldGrid], rings_m: Sequence[Array] = (), walks: Sequence[Walk] = ()) -> Array:
+    """(3,) what is subtracted from every coordinate: the middle of all there is in the plane, and z as it is."""
+    corners = [np.reshape(grid.bounds_m, (2, 3))[:, :2] for grid in grids]
+    corners += [ring[:, :2] for ring in rings_m if len(ring)]
+    corners += [walk.p_building_m[:, :2] for walk in walks if len(walk.p_building_m)]
+    if not corners:
+        return np.zeros(3)
+    low = np.min([c.min(axis=0) for c in corners], axis=0)
+    high = np.max([c.max(axis=0) for c in corners], axis=0)
+    return np.append((low + high) / 2, 0.0)
+
+
+def camera_pose(
+    grids: Sequence[FieldGrid], origin_m: Array, top: bool = False, spread_m: float = 0.0
+) -> tuple[Array, Array]:
+    """Camera position and look-at point (3,) each, local metres: from the south, or from straight above.
+
+    spread_m: how much higher the topmost floor is drawn than it is.
+    """
+    bounds = np.array([grid.bounds_m for grid in grids] or [(-5.0, -5.0, 0.0, 5.0, 5.0, 0.0)])
+    low, high = bounds[:, :3].min(axis=0) - origin_m, bounds[:, 3:].max(axis=0) - origin_m
+    high[2] += spread_m
+    target = (low + high) / 2
+    width, depth, height = high - low
+    if top:
+        return target + np.array([0.0, -1e-3, 0.85 * max(width, depth, 2.0) + height / 2]), target
+    reach = max(float(np.hypot(width, depth)), 2.0) * 0.62 + 0.45 * height
+    slant = np.array([-0.12, -0.8, 0.8]) if height < 0.2 * depth else np.array([-0.2, -1.0, 0.55])
+    return target + reach * slant / np.linalg.norm(slant) * 1.25, target
+
+
+def surface(grid: FieldGrid, values: Array, scale: ColourScale, origin_m: Array, height_index: int = 0) -> Surface:
+    """A layer's values (ny, nx), NaN where unmeasured, as a picture of at most MAX_POINTS cells.
+
+    Every s-th cell is shown when there are more. Transparent cells carry their nearest neighbour's colour, so that
+    the renderer's interpolation does not darken the rim.
+    """
+    stride = max(1, int(np.ceil(np.sqrt(values.size / MAX_POINTS))))
+    shown = values[::stride, ::stride]
+    measured = np.isfinite(shown)
+    filled = shown
+    if measured.any():
+        nearest = distance_transform_edt(~measured, return_distances=False, return_indices=True)
+        filled = shown[tuple(nearest)]
+    alpha = np.where(measured, 255, 0).astype(np.uint8)
+    cell = stride * grid.resolution_m
+    ny, nx = shown.shape
+    centre = np.array([grid.origin_m[0] + (nx - 1) * cell / 2, grid.origin_m[1] + (ny - 1) * cell / 2])
+    x, y = centre - origin_m[:2]
+    z = float(grid.heights_m[height_index] - origin_m[2])
+    return Surface(np.dstack([scale.rgb(filled), alpha]), (float(x), float(y), z), (nx * cell, ny * cell))
+
+
+def suggested_arrow_spacing_m(grid: FieldGrid, height_index: int = 0) -> float:
+    """A spacing in metres, a multiple of the cell size, that gives some hundreds of arrows, few enough to be read."""
+    cells = max(1, int(grid.measured[height_index].sum()))
+    return grid.resolution_m * max(1, int(np.ceil(np.sqrt(cells / _USUAL_ARROWS))))
+
+
+def suggested_separation_m(grids: Sequence[FieldGrid]) -> float:
+    """Metres to add between floors so that each can be seen over the one below: half metres, 0 for a single floor."""
+    heights = sorted(float(grid.heights_m[0]) for grid in grids)
+    if len(heights) < 2:
+        return 0.0
+    bounds = np.array([grid.bounds_m for grid in grids])
+    depth = float(bounds[:, 4].max() - bounds[:, 1].min())
+    gap = (heights[-1] - heights[0]) / (len(heights) - 1)
+    return float(np.clip(np.round(2.0 * (0.8 * depth - gap)) / 2.0, 0.0, 40.0))
+
+
+def field_arrows(grid: FieldGrid, origin_m: Array, spacing_m: float, height_index: int = 0) -> Arrows:
+    """The mean field at every measured cell of a coarser lattice, at most MAX_ARROWS, standing on the map's plane.
+
+    The 99th percentile of the magnitudes spans 1.4 times the spacing. A level map knows only the vertical direction, so
+    its arrows are vertical; a norm map has none.
+    """
+    components = {"vector": 3, "level": 2, "norm": 0}[grid.components]
+    stride = max(1, round(spacing_m / grid.resolution_m))
+    while components and grid.measured[height_index, ::stride, ::stride].sum() > MAX_ARROWS:
+        stride += 1
+    j, i = np.nonzero(grid.measured[height_index, ::stride, ::stride])
+    if components == 0 or len(j) == 0:
+        return Arrows(np.zeros((0, 2, 3), dtype=np.float32), np.zeros(0), stride * grid.resolution_m)
+    j, i = j * stride, i * stride
+    B_uT = grid.mean_uT[height_index, j, i].astype(np.float64)
+    if components == 2:
+        B_uT = np.stack([np.zeros(len(j)), np.zeros(len(j)), B_uT[:, 1]], axis=1)
+    magnitude = np.linalg.norm(B_uT, axis=1)
+    spacing = stride * grid.resolution_m
+    direction = B_uT * (1.4 * spacing / max(float(np.percentile(magnitude, 99.0)), 1e-9))
+    tail = np.empty_like(direction)
+    tail[:, 0] = grid.origin_m[0] + i * grid.resolution_m - origin_m[0]
+    tail[:, 1] = grid.origin_m[1] + j * grid.resolution_m - origin_m[1]
+    tail[:, 2] = grid.heights_m[height_index] - origin_m[2] + _CLEARANCE_M + np.maximum(-direction[:, 2], 0.0)
+    return Arrows(np.stack([tail, tail + direction], axis=1).astype(np.float32), magnitude, spacing)
+
+
+def walk_segments(walks: Sequence[Walk], origin_m: Array) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Walks as line segments (m, 2, 3) and their colours (m, 2, 3), one colour per walk, thinned when very long."""
+    total = sum(len(walk.p_building_m) for walk in walks)
+    stride = max(1, int(np.ceil(total / _MAX_WALK_SEGMENTS)))
+    segments, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), dtype=np.uint8)]
+    for k, walk in enumerate(walks):
+        p = walk.p_building_m[::stride] - origin_m + np.array([0.0, 0.0, _CLEARANCE_M])
+        segments.append(np.stack([p[:-1], p[1:]], axis=1))
+        colour = np.array(WALK_COLOURS[k % len(WALK_COLOURS)], dtype=np.uint8)
+        colours.append(np.broadcast_to(colour, (max(len(p) - 1, 0), 2, 3)))
+    return np.concatenate(segments).astype(np.float32), np.concatenate(colours)
+
+
+def ring_segments(rings_m: Sequence[Array], elevation_m: float, origin_m: Array) -> NDArray[np.float32]:
+    """The outline of a floor at its slab as closed line segments (m, 2, 3)."""
+    segments = [np.zeros((0, 2, 3))]
+    for ring in rings_m:
+        p = np.column_stack([ring[:, :2], np.full(len(ring), elevation_m)]) - origin_m
+        segments.append(np.stack([p, np.roll(p, -1, axis=0)], axis=1))
+    return np.concatenate(segments).astype(np.float32)
+
+
+def draw_surface(scene: SceneApi, name: str, picture: Surface, visible: bool = True) -> ImageHandle:
+    """Put a layer's picture into the scene."""
+    return scene.add_image(
+        name, picture.rgba, *picture.size_m, format="png", cast_shadow=False, receive_shadow=False,
+        position=picture.centre_m, visible=visible,
+    )  # fmt: skip
+
+
+def draw_arrows(scene: SceneApi, name: str, arrows: Arrows, scale: ColourScale, visible: bool = True) -> ArrowsHandle:
+    """Put arrows into the scene, coloured by |B|; thick enough for their spacing."""
+    thickness = arrows.spacing_m
+    return scene.add_arrows(
+        name, arrows.ends_m, scale.rgb(arrows.magnitude_uT), shaft_radius=0.04 * thickness,
+        head_radius=0.12 * thickness, head_length=0.35 * thickness, visible=visible,
+    )  # fmt: skip
+
+
+def ground_cell_m(grids: Sequence[FieldGrid]) -> float:
+    """The size of a ground square in metres: 1, 2, 5 or 10 times a power of ten, some dozen across the map."""
+    bounds = np.array([grid.bounds_m for grid in grids] or [(0.0, 0.0, 0.0, 10.0, 10.0, 0.0)])
+    span = float(np.max(bounds[:, 3:5].max(axis=0) - bounds[:, :2].min(axis=0)))
+    power = 10.0 ** np.floor(np.log10(max(span, 1.0) / 12.0))
+    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power * 12.0 >= span * 0.999))
+
+
+def draw_ground(scene: SceneApi, name: str, grids: Sequence[FieldGrid], origin_m: Array, z_m: float) -> None:
+    """A faint lattice under the lowest floor for scale; its lines lie on whole multiples of its cell."""
+    cell = ground_cell_m(grids)
+    bounds = np.array([grid.bounds_m for grid in grids] or [(-5.0, -5.0, 0.0, 5.0, 5.0, 0.0)])
+    low = np.floor(bounds[:, :2].min(axis=0) / cell - 1.0) * cell
+    high = np.ceil(bounds[:, 3:5].max(axis=0) / cell + 1.0) * cell
+    x, y = (low + high) / 2 - origin_m[:2]
+    width, height = high - low
+    colour = (70, 76, 84)
+    scene.add_grid(
+        name, float(width), float(height), cell_size=cell, section_size=cell, cell_color=colour, section_color=colour,
+        fade_strength=0.0, fade_distance=1e6, shadow_opacity=0.0,
+        position=(float(x), float(y), z_m - float(origin_m[2])),
+    )  # fmt: skip
+
+
+def draw_lines(
+    scene: SceneApi,
+    name: str,
+    segments_m: NDArray[np.float32],
+    colours: NDArray[np.uint8] | tuple[int, int, int],
+    width_px: float,
+    visible: bool = True,
+) -> LineSegmentsHandle:
+    """Put line segments (m, 2, 3) into the scene, as wide on the screen at every distance."""
+    return scene.add_line_segments(
+        name, segments_m, np.asarray(colours), thickness=width_px, thickness_units="screen", visible=visible
+    )

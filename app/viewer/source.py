@@ -1,0 +1,84 @@
+"""What the viewer asks of the rest of the house: who is signed in, and what may be shown to them.
+
+The page never sees the database. The composition root hands it one callable (key to identity) and one `ViewerSource`;
+every question carries the organisation, so an answer can only ever be about that organisation's own objects.
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Protocol
+
+from app.field.grid import FieldGrid
+from app.geometry import Array
+
+__all__ = ["Authenticate", "Identity", "ViewedBuilding", "ViewedFloor", "ViewerSource", "Walk", "may_view"]
+
+
+class Identity(Protocol):
+    """Whoever a key belongs to."""
+
+    @property
+    def organisation_id(self) -> str: ...
+
+    @property
+    def scopes(self) -> Collection[str]: ...
+
+
+Authenticate = Callable[[str], Identity | None]
+"""An API key to its identity, or None when there is no such key or it was revoked. May block: called off the loop."""
+
+
+def may_view(identity: Identity) -> bool:
+    """Whether the scopes of an identity let it see maps."""
+    return "map:read" in identity.scopes or "admin" in identity.scopes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewedFloor:
+    """A floor as the page needs it. `rings_m`: outline, each (k, 2) in building metres, closed; () when unknown.
+
+    map_id, grid_sha256 are None while the floor has no active map.
+    """
+
+    id: str
+    name: str
+    ordinal: int
+    elevation_m: float
+    rings_m: tuple[Array, ...] = ()
+    map_id: str | None = None
+    grid_sha256: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewedBuilding:
+    """A building and its floors, lowest first."""
+
+    id: str
+    name: str
+    floors: tuple[ViewedFloor, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walk:
+    """One survey walk: positions (n, 3) in building metres and the field as measured (n, c) in uT."""
+
+    survey_id: str
+    name: str
+    p_building_m: Array
+    B_uT: Array
+
+
+class ViewerSource(Protocol):
+    """What can be shown, one organisation at a time. Called from worker threads, several at once."""
+
+    def buildings(self, organisation_id: str) -> list[ViewedBuilding]:
+        """Every building of the organisation, by name."""
+        ...
+
+    def grid(self, organisation_id: str, map_id: str) -> FieldGrid:
+        """The grid of a map. Raises NotFound for a map that is not ready or not the organisation's."""
+        ...
+
+    def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
+        """The walks that count towards a floor's map. Raises NotFound for a floor that is not the organisation's."""
+        ...

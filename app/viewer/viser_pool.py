@@ -1,0 +1,148 @@
+"""One viser server per organisation, started by its first visitor and stopped when nobody has looked for a while.
+
+Isolation is by construction: an organisation's server is made with that organisation's content only. Nothing is put
+into a server's shared scene; a connection that does not bring the server's secret in its path (any other program on
+this machine) gets an empty page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlencode, urlsplit
+
+from starlette.concurrency import run_in_threadpool
+
+from app.viewer.client_view import ClientView, Link
+from app.viewer.content import GridCache, OrganisationContent
+from app.viewer.source import ViewerSource
+from app.viewer.viser_server import LOOPBACK, start_viser, stop_viser
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, ViserServer
+
+__all__ = ["OrganisationViewer", "ViserPool"]
+
+_log = logging.getLogger(__name__)
+_GRID_BYTES = 256 * 2**20
+
+
+@dataclass(slots=True, eq=False)
+class OrganisationViewer:
+    """The viser server of one organisation and the browsers looking at it."""
+
+    server: ViserServer
+    secret: str
+    visitors: int = 0
+    idle_since: float = 0.0
+    views: dict[int, ClientView] = field(default_factory=dict)
+
+    @property
+    def http_url(self) -> str:
+        return f"http://{LOOPBACK}:{self.server.get_port()}/"
+
+    def websocket_url(self, link: Link) -> str:
+        """Where the proxy connects for a browser that asked for `link`."""
+        asked = {"secret": self.secret, "building": link.building_id, "floor": link.floor_id}
+        query = urlencode({name: value for name, value in asked.items() if value})
+        return f"ws://{LOOPBACK}:{self.server.get_port()}/?{query}"
+
+
+class ViserPool:
+    """The servers by organisation. `clock` counts seconds and never goes back."""
+
+    def __init__(
+        self, source: ViewerSource, idle_seconds: float = 600.0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._source = source
+        self._idle_seconds = idle_seconds
+        self._clock = clock
+        self._grids = GridCache(_GRID_BYTES)
+        self._viewers: dict[str, OrganisationViewer] = {}
+        self._lock = asyncio.Lock()
+        self._sweeper: asyncio.Task[None] | None = None
+
+    def running(self) -> dict[str, OrganisationViewer]:
+        """The servers running now, by organisation."""
+        return dict(self._viewers)
+
+    @contextlib.asynccontextmanager
+    async def visit(self, organisation_id: str) -> AsyncIterator[OrganisationViewer]:
+        """The organisation's server, started if need be, and kept while the visit lasts."""
+        async with self._lock:
+            viewer = self._viewers.get(organisation_id)
+            if viewer is None:
+                viewer = await run_in_threadpool(self._start, organisation_id)
+                self._viewers[organisation_id] = viewer
+            if self._sweeper is None:
+                self._sweeper = asyncio.create_task(self._sweep())
+            viewer.visitors += 1
+        try:
+            yield viewer
+        finally:
+            viewer.visitors -= 1
+            viewer.idle_since = self._clock()
+
+    async def stop_idle(self) -> None:
+        """Stop every server that nobody has looked at for `idle_seconds`."""
+        async with self._lock:
+            now = self._clock()
+            for organisation_id, viewer in list(self._viewers.items()):
+                if viewer.visitors == 0 and now - viewer.idle_since >= self._idle_seconds:
+                    del self._viewers[organisation_id]
+                    await run_in_threadpool(stop_viser, viewer.server)
+
+    async def close(self) -> None:
+        """Stop everything."""
+        if self._sweeper is not None:
+            self._sweeper.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._sweeper
+            self._sweeper = None
+        async with self._lock:
+            for viewer in self._viewers.values():
+                await run_in_threadpool(stop_viser, viewer.server)
+            self._viewers.clear()
+
+    async def _sweep(self) -> None:
+        while True:
+            await asyncio.sleep(max(self._idle_seconds / 4, 0.05))
+            await self.stop_idle()
+
+    def _start(self, organisation_id: str) -> OrganisationViewer:
+        viewer = OrganisationViewer(start_viser(), secrets.token_urlsafe(32))
+        content = OrganisationContent(organisation_id, self._source, self._grids)
+
+        def welcome(client: ClientHandle) -> None:
+            link = _link_of(client, viewer)
+            if link is not None:
+                try:
+                    viewer.views[client.client_id] = ClientView(client, content, link)
+                except Exception:
+                    _log.exception("a page could not be built for organisation %s", organisation_id)
+                    client.add_notification("This page could not be built", "The server's log says why.", color="red")
+
+        def farewell(client: ClientHandle) -> None:
+            viewer.views.pop(client.client_id, None)
+
+        viewer.server.on_client_connect(welcome)
+        viewer.server.on_client_disconnect(farewell)
+        return viewer
+
+
+def _link_of(client: ClientHandle, viewer: OrganisationViewer) -> Link | None:
+    """The deep link in the path the proxy connected with; None for a connection that did not come by the proxy."""
+    # viser 1.1 keeps no public record of a connection's request; the version is pinned and a test covers this.
+    connection = viewer.server._websock_server._live_connections.get(client.client_id)
+    if connection is None or connection.request is None:
+        return None
+    asked = parse_qs(urlsplit(connection.request.path).query)
+    if not secrets.compare_digest(asked.get("secret", [""])[0], viewer.secret):
+        return None
+    return Link(asked.get("building", [None])[0], asked.get("floor", [None])[0])

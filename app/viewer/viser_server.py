@@ -1,0 +1,58 @@
+"""Starting and stopping viser servers: on loopback, at a free port, quietly, and never open to the world.
+
+viser is imported here, inside the function, so that a web process which shows nobody the page never loads it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+__all__ = ["LOOPBACK", "start_viser", "stop_viser"]
+
+LOOPBACK = "127.0.0.1"
+_one_at_a_time = threading.Lock()
+
+
+def start_viser() -> ViserServer:
+    """A viser server on 127.0.0.1 at an ephemeral port, which refuses to open a public tunnel. Blocks for a moment."""
+    import viser
+
+    class LoopbackServer(viser.ViserServer):
+        """viser lets any connected client ask for a public share address; this one has none to give."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    with _quiet_console():
+        server = LoopbackServer(host=LOOPBACK, port=0, verbose=False)
+    server.scene.world_axes.visible = False
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(33, 145, 140))
+    server.gui.main_panel.dock_right()
+    server.gui.set_panel_label("Isodyn")
+    return server
+
+
+def stop_viser(server: ViserServer) -> None:
+    """Stop a server and wait for its threads."""
+    with _quiet_console():
+        server.stop()
+
+
+@contextmanager
+def _quiet_console() -> Iterator[None]:
+    """viser prints its loopback address, which is of no use to anybody, on rich's shared console."""
+    import rich
+
+    console = rich.get_console()
+    with _one_at_a_time:
+        before, console.quiet = console.quiet, True
+        try:
+            yield
+        finally:
+            console.quiet = before

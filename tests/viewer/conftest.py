@@ -1,0 +1,118 @@
+"""A small building for the viewer's tests: an analytic field, three floors, two organisations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from app.errors import NotFound
+from app.field.grid import FieldGrid
+from app.field.samples import COMPONENT_NAMES, Components
+from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
+
+
+def make_grid(
+    components: Components = "vector",
+    height_m: float = 1.2,
+    size_m: tuple[float, float] = (24.0, 14.0),
+    resolution_m: float = 0.25,
+    origin_m: tuple[float, float] = (100.0, 40.0),
+    heights: int = 1,
+    seed: int = 1,
+) -> FieldGrid:
+    """A smooth field of a few dipole-like bumps, measured inside an L-shaped corridor."""
+    rng = np.random.default_rng(seed)
+    nx, ny = (int(s / resolution_m) + 1 for s in size_m)
+    x, y = np.meshgrid(np.arange(nx) * resolution_m, np.arange(ny) * resolution_m)
+    mean = np.empty((heights, ny, nx, 3))
+    mean[:] = (18.0, 4.0, -44.0)
+    for _ in range(14):
+        cx, cy, width = rng.uniform(0, size_m[0]), rng.uniform(0, size_m[1]), rng.uniform(1.0, 2.5)
+        bump = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * width**2))
+        mean += bump[None, :, :, None] * rng.normal(0.0, 14.0, size=3)
+    mean *= (1.0 - 0.1 * np.arange(heights))[:, None, None, None]
+    measured = ((y < 6.0) | (x < 9.0)) & (np.hypot(x - 15.0, y - 3.0) > 1.5)
+    sd = np.where(measured, 1.0 + 0.3 * np.sin(x), 12.0)[None, :, :, None] * np.ones((heights, 1, 1, 3))
+    if components == "level":
+        mean = np.stack([np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]], axis=-1)
+    elif components == "norm":
+        mean = np.linalg.norm(mean, axis=-1, keepdims=True)
+    c = len(COMPONENT_NAMES[components])
+    gradient = np.stack(np.gradient(mean, resolution_m, axis=(2, 1)), axis=-1)
+    return FieldGrid(
+        components=components,
+        origin_m=origin_m,
+        resolution_m=resolution_m,
+        heights_m=height_m + 0.5 * np.arange(heights),
+        mean_uT=mean.astype(np.float32),
+        sd_uT=sd[..., :c].astype(np.float32),
+        gradient_uT_per_m=gradient.astype(np.float32),
+        measured=np.broadcast_to(measured, mean.shape[:3]).copy(),
+        ambient_uT=np.full(c, 10.0),
+        prior_sd_uT=np.full(c, 12.0),
+        noise_sd_uT=np.full(c, 0.5),
+    )
+
+
+def make_walk(name: str, height_m: float = 1.2, offset_m: float = 0.0) -> Walk:
+    """A walk up and down the corridor of `make_grid`."""
+    s = np.linspace(0.0, 1.0, 200)
+    p = np.column_stack([100.5 + 23.0 * s, 41.0 + offset_m + 0.4 * np.sin(9 * s), np.full(200, height_m)])
+    return Walk(survey_id=f"survey-{name}", name=name, p_building_m=p, B_uT=np.full((200, 3), 30.0))
+
+
+@dataclass
+class MemorySource:
+    """A ViewerSource over dictionaries: a third implementation of the protocol, beside the database's."""
+
+    by_organisation: dict[str, list[ViewedBuilding]]
+    grids: dict[str, FieldGrid]
+    walks_by_floor: dict[str, list[Walk]]
+    asked: list[tuple[str, str]] = field(default_factory=list)
+
+    def buildings(self, organisation_id: str) -> list[ViewedBuilding]:
+        return self.by_organisation.get(organisation_id, [])
+
+    def _floors(self, organisation_id: str) -> list[ViewedFloor]:
+        return [f for b in self.buildings(organisation_id) for f in b.floors]
+
+    def grid(self, organisation_id: str, map_id: str) -> FieldGrid:
+        self.asked.append((organisation_id, map_id))
+        if map_id not in {f.map_id for f in self._floors(organisation_id)}:
+            raise NotFound(f"no map {map_id}")
+        return self.grids[map_id]
+
+    def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
+        self.asked.append((organisation_id, floor_id))
+        if floor_id not in {f.id for f in self._floors(organisation_id)}:
+            raise NotFound(f"no floor {floor_id}")
+        return self.walks_by_floor.get(floor_id, [])
+
+
+@pytest.fixture(scope="session")
+def grid_of() -> Callable[..., FieldGrid]:
+    return make_grid
+
+
+@pytest.fixture(scope="session")
+def walk_of() -> Callable[..., Walk]:
+    return make_walk
+
+
+@pytest.fixture
+def source() -> MemorySource:
+    """Organisation "north" has a tower of two mapped floors and one without a map; "south" has a shed."""
+    ring = np.array([[99.5, 39.5], [124.5, 39.5], [124.5, 54.5], [99.5, 54.5], [99.5, 39.5]])
+    ground = ViewedFloor("floor-0", "Ground", 0, 0.0, (ring,), "map-0", "0" * 64)
+    first = ViewedFloor("floor-1", "First", 1, 4.0, (ring,), "map-1", "1" * 64)
+    roof = replace(first, id="floor-2", name="Roof", ordinal=2, elevation_m=8.0, map_id=None, grid_sha256=None)
+    shed = ViewedFloor("floor-s", "Shed floor", 0, 0.0, (), "map-s", "2" * 64)
+    return MemorySource(
+        {
+            "north": [ViewedBuilding("tower", "Tower", (ground, first, roof)), ViewedBuilding("barn", "Barn", ())],
+            "south": [ViewedBuilding("shed", "Secret shed", (shed,))],
+        },
+        {"map-0": make_grid(), "map-1": make_grid(height_m=5.2, seed=2), "map-s": make_grid("level", seed=3)},
+        {"floor-0": [make_walk("lobby"), make_walk("hall", offset_m=2.0)], "floor-1": [make_walk("upstairs", 5.2)]},
+    )
