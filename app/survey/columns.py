@@ -23,6 +23,7 @@ MAX_FAULTS = 20
 """Most faults listed for one file."""
 MAX_HORIZONTAL_M = 10_000.0
 MAX_VERTICAL_M = 1_000.0
+LARGEST_VALUE = 1e100
 JUMP_M, JUMP_M_PER_S = 20.0, 50.0
 QUATERNION_NORM_TOLERANCE = 0.05
 
@@ -108,9 +109,13 @@ def _refuse(faults: list[Fault], message: str) -> None:
 
 
 def _not_finite(columns: Columns) -> list[Fault]:
+    def reason(x: float) -> str:
+        return f"{x:g} is beyond any measurement" if np.isfinite(x) else f"{x} is not finite"
+
     faults: list[Fault] = []
     for name, column in columns.values.items():
-        faults += columns.faults(~np.isfinite(column), name, lambda i, column=column: f"{column[i]} is not finite")  # type: ignore[misc]
+        wrong = ~(np.abs(column) <= LARGEST_VALUE)
+        faults += columns.faults(wrong, name, lambda i, column=column: reason(float(column[i])))  # type: ignore[misc]
     return faults
 
 

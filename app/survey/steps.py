@@ -15,6 +15,7 @@ RATE_HZ = 50.0
 CUTOFF_HZ = 3.0
 SHORTEST_STEP_S = 0.3
 LONGEST_STEP_S = 1.0
+LONGEST_USUAL = 1.5
 LEAST_PROMINENCE_M_PER_S2 = 0.8
 
 
@@ -42,7 +43,8 @@ class Steps:
 def detect_steps(t_s: Array, force_m_per_s2: Array) -> Steps:
     """Steps in accelerometer samples (n, 3) at times (n,).
 
-    A step ends at a peak and begins at the peak before it, or `LONGEST_STEP_S` earlier after standing still.
+    A step ends at a peak and begins at the peak before it; after standing still, and at the start, it is given about
+    the usual time of a step, and may have begun before the recording did. A single peak is no walk.
     """
     grid_s = np.arange(t_s[0], t_s[-1], 1.0 / RATE_HZ)
     if len(grid_s) < RATE_HZ:
@@ -51,7 +53,11 @@ def detect_steps(t_s: Array, force_m_per_s2: Array) -> Steps:
     smooth = sosfiltfilt(butter(2, CUTOFF_HZ, fs=RATE_HZ, output="sos"), length - length.mean())
     distance = int(SHORTEST_STEP_S * RATE_HZ)
     peaks, _ = find_peaks(smooth, distance=distance, prominence=LEAST_PROMINENCE_M_PER_S2)
-    longest = int(LONGEST_STEP_S * RATE_HZ)
-    starts = np.maximum(np.concatenate([[0], peaks[:-1]]), peaks - longest) if len(peaks) else peaks
+    if len(peaks) < 2:
+        return Steps(np.empty(0), np.empty(0), np.empty(0))
+    end_s = grid_s[peaks]
+    usual_s = min(float(np.median(np.diff(end_s))), LONGEST_STEP_S)
+    start_s = np.concatenate([[end_s[0] - usual_s], np.maximum(end_s[:-1], end_s[1:] - LONGEST_USUAL * usual_s)])
+    starts = np.maximum(np.searchsorted(grid_s, start_s), 0)
     amplitude = np.array([smooth[p] - smooth[s : p + 1].min() for s, p in zip(starts, peaks, strict=True)])
-    return Steps(grid_s[starts], grid_s[peaks], STEP_LENGTH_FACTOR * amplitude**0.25)
+    return Steps(start_s, end_s, STEP_LENGTH_FACTOR * amplitude**0.25)
