@@ -16,9 +16,9 @@ class LocateOptions:
 
     mlr_ratio: float = 2.0
     mlr_min_distance_m: float = 5.0
-    abl_threshold: float | None = None     # None: the default of techniques.py, as a multiple of the uniform mass
+    abl_threshold: float | None = None  # None: the default of techniques.py, as a multiple of the uniform mass
     abl_bin_m: float = 2.0
-    gate_probability: float = 0.997        # chi-square gate on the best pose (Shockley 8.5)
+    gate_probability: float = 0.997  # chi-square gate on the best pose (Shockley 8.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,10 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class MlEstimate:
-    """Maximum likelihood (Shockley 8.1): always answers if any pose was searched."""
+    """Maximum likelihood (Shockley 8.1): always answers if any pose was searched.
+
+    The best pose of the lattice, refined between the cells, and the log-likelihood of the window there, not tempered.
+    """
 
     floor_id: str
     position_m: tuple[float, float, float]
@@ -41,7 +44,9 @@ class MlEstimate:
 
 @dataclass(frozen=True, slots=True)
 class MlrEstimate:
-    """Maximum likelihood ratio (Shockley 8.2). `available` False: position is None and `reason` says why."""
+    """Maximum likelihood ratio (Shockley 8.2). `available` False: position is None and `reason` says why.
+
+    `ratio` is that of the tempered likelihoods, and a lower bound where no rival is within what was searched."""
 
     available: bool
     ratio: float | None
@@ -74,15 +79,20 @@ class Mode:
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
     """The belief. `radius_*_m` are horizontal radii about `position_m` holding 68 and 95 % of the mass on that floor,
-    position and covariance those of the strongest floor."""
+    position and covariance those of the strongest floor: the mean of its strongest mode, and the second moment of its
+    mass about it. `off_map_probability`: that the window was walked where nothing is mapped; the other probabilities
+    are given it was on a map. `missed_probability`: at most this much mass lies in poses the search left out.
+    """
 
     floor_probability: dict[str, float]
     floor_id: str
     position_m: tuple[float, float, float]
-    covariance_m2: Array                   # (2, 2)
+    covariance_m2: Array  # (2, 2)
     radius_68_m: float
     radius_95_m: float
     modes: tuple[Mode, ...] = field(default=())
+    off_map_probability: float = 0.0
+    missed_probability: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +100,8 @@ class Fix:
     """The answer to a window. `ml` and `posterior` are None only when no floor had a map to search."""
 
     status: Status
-    reason: str | None                     # for every status but "fix": what is wrong and what would help
+    reason: str | None  # for every status but "fix": what is wrong and what would help
     ml: MlEstimate | None
     mlr: MlrEstimate
     abl: AblEstimate
     posterior: Posterior | None
-    search_ms: float

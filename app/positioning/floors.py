@@ -1,0 +1,117 @@
+"""A floor made ready for searching: its field as features, padded with the prior, under min/max pyramids."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.field.grid import FieldGrid
+from app.field.pyramid import Pyramid, build_pyramid
+from app.field.samples import Components
+from app.geometry import Array
+from app.positioning.features import reduce_field, reduce_variance
+
+__all__ = ["TOP_LEVEL", "Plane", "SearchableFloor", "prepare_floor", "reduce_floor"]
+
+TOP_LEVEL = 4  # the search starts from blocks of 2^4 cells
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane:
+    """One layer of a floor's grid, as features.
+
+    mean_uT, variance_uT2  (ny + 2, nx + 2, c): the field and the variance of one measurement about it (map sd and map
+                           noise together), one cell of prior on each side; unmeasured cells hold the prior
+    measured               (ny, nx)
+    ambient_uT, off_map_variance_uT2   (c,) the same where there is no map
+    gradient_uT_per_m      rms gradient of the features over the measured cells
+    """
+
+    height_m: float
+    origin_m: tuple[float, float]
+    resolution_m: float
+    mean_uT: Float32
+    variance_uT2: Float32
+    measured: NDArray[np.bool_]
+    ambient_uT: Array
+    off_map_variance_uT2: Array
+    gradient_uT_per_m: float
+    pyramid: Pyramid
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) cells."""
+        return self.measured.shape[0], self.measured.shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        return self.mean_uT.nbytes + self.variance_uT2.nbytes + self.measured.nbytes + self.pyramid.nbytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchableFloor:
+    """A floor's map and what the search needs of it; immutable, to be cached behind the map's content hash."""
+
+    floor_id: str
+    grid: FieldGrid
+    components: Components
+    planes: tuple[Plane, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held beside the grid itself: about 150 per cell and three components."""
+        return sum(plane.nbytes for plane in self.planes)
+
+
+def prepare_floor(floor_id: str, grid: FieldGrid) -> SearchableFloor:
+    """Planes and pyramids of a map with its own components: tens of milliseconds per 100 x 100 m at 0.25 m."""
+    return _prepare(floor_id, grid, grid.components)
+
+
+def reduce_floor(floor: SearchableFloor, components: Components) -> SearchableFloor:
+    """The same floor on poorer features (Kuevor B12 for the norm); itself when they are already its own."""
+    return floor if floor.components == components else _prepare(floor.floor_id, floor.grid, components)
+
+
+def _prepare(floor_id: str, grid: FieldGrid, components: Components) -> SearchableFloor:
+    planes = tuple(_plane(grid, layer, components) for layer in range(len(grid.heights_m)))
+    return SearchableFloor(floor_id, grid, components, planes)
+
+
+def _plane(grid: FieldGrid, layer: int, components: Components) -> Plane:
+    source, measured = grid.components, grid.measured[layer]
+    noise = np.square(grid.noise_sd_uT)
+    mean = np.where(measured[..., None], grid.mean_uT[layer], grid.ambient_uT).astype(np.float64)
+    sd = np.where(measured[..., None], grid.sd_uT[layer], grid.prior_sd_uT).astype(np.float64)
+    variance = reduce_variance(mean, np.square(sd) + noise, source, components)
+    ambient = reduce_field(grid.ambient_uT, source, components)
+    off_map = reduce_variance(grid.ambient_uT, np.square(grid.prior_sd_uT) + noise, source, components)
+    features = _padded(reduce_field(mean, source, components), ambient)
+    spread = _padded(np.maximum(variance, 1e-6), np.maximum(off_map, 1e-6))
+    return Plane(
+        height_m=float(grid.heights_m[layer]),
+        origin_m=grid.origin_m,
+        resolution_m=grid.resolution_m,
+        mean_uT=features,
+        variance_uT2=spread,
+        measured=measured,
+        ambient_uT=ambient,
+        off_map_variance_uT2=np.maximum(off_map, 1e-6),
+        gradient_uT_per_m=_rms_gradient(grid, layer),
+        pyramid=build_pyramid(features, spread, TOP_LEVEL),
+    )
+
+
+def _padded(cells: Array, prior: Array) -> Float32:
+    ny, nx, c = cells.shape
+    padded = np.empty((ny + 2, nx + 2, c), dtype=np.float32)
+    padded[:] = prior
+    padded[1:-1, 1:-1] = cells
+    return padded
+
+
+def _rms_gradient(grid: FieldGrid, layer: int) -> float:
+    """Root of the mean squared gradient (summed over components and axes) of the measured cells, uT/m."""
+    steep = grid.gradient_uT_per_m[layer][grid.measured[layer]].astype(np.float64)
+    return float(np.sqrt(np.mean(np.sum(np.square(steep), axis=(1, 2))))) if len(steep) else 0.0

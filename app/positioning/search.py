@@ -1,0 +1,254 @@
+"""Exact global search: branch and bound over the poses of all candidate floors, with one shared incumbent.
+
+Returns the pose an exhaustive scan would return, and every pose within a window of it (see `kernels` for the bound).
+A beam of promising blocks finds a good incumbent first; then every level of blocks is bounded, pruned and split, all
+headings at once. What was pruned is bounded too: `missed_mass` says how much posterior it could hold at most.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.geometry import Array
+from app.positioning.floors import TOP_LEVEL, Plane
+from app.positioning.kernels import block_bounds, pose_costs
+from app.positioning.lattice import ReducedWindow, turn_window
+
+__all__ = ["CAPACITY", "Candidates", "PosePrior", "search"]
+
+Blocks = NDArray[np.int32]
+CAPACITY = 400_000  # poses kept at most
+_BLOCKS_PER_POSE = 5  # how many blocks of a level may be followed, per pose of the capacity
+_BEAM = 192
+_BEAM_SAMPLES = 4
+_NEGLIGIBLE_NATS = 60.0
+_SPARE_NATS = 12.0  # tempered: how far beyond the limit a bound is followed, so that the missed mass comes out small
+
+
+@dataclass(frozen=True, slots=True)
+class PosePrior:
+    """Gaussian prior of the last sample's position (metres) and of the heading lattice, as tempered log densities.
+
+    position_m, sd_m   None: flat
+    heading_log        (h,) log density of each heading up to a constant
+    """
+
+    position_m: tuple[float, float, float] | None
+    sd_m: float
+    heading_log: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Poses by descending score.
+
+    plane, heading, row, column   (n,) indices
+    score                         (n,) log L + temper log prior, nats
+    window_nats                   every pose within this of the best is here (smaller than asked when too many are)
+    missed_mass                   at most this much, relative to the best pose's tempered posterior, was left out
+    poses                         how many poses the lattice has
+    """
+
+    plane: NDArray[np.int64]
+    heading: NDArray[np.int64]
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    score: Array
+    window_nats: float
+    missed_mass: float
+    poses: int
+
+
+class _PlaneCosts:
+    """Costs and bounds on one plane; `constant` turns a cost into -2 score, comparable between planes."""
+
+    def __init__(
+        self, plane: Plane, window: ReducedWindow, headings_rad: Array, prior: PosePrior, temper: float, demeaned: bool
+    ) -> None:
+        turned = turn_window(window, headings_rad, plane.resolution_m)
+        order = telling_order(window, plane)
+        self.plane, self.demeaned, self.headings = plane, demeaned, len(headings_rad)
+        self.z = np.ascontiguousarray(turned.features_uT[:, order])
+        self.row = np.ascontiguousarray(turned.offset_cells[:, order, 0])
+        self.column = np.ascontiguousarray(turned.offset_cells[:, order, 1])
+        self.noise = window.noise_variance_uT2[order]
+        noises, self.kind = np.unique(self.noise, return_inverse=True)
+        self.ladder = plane.pyramid.ladder_uT2[None] + noises[:, None, None]
+        self.log_ladder = np.log(self.ladder / self.ladder[:, :, :1])
+        self.least = np.ascontiguousarray(plane.pyramid.ladder_uT2[:, 0])
+        self.heading_cost = -2.0 * temper * prior.heading_log
+        self.prior, height = _prior_in_cells(plane, prior, temper)
+        floor = self.least[None, :] + self.noise[:, None]
+        n, c = floor.shape
+        self.constant = float(np.log(floor).sum() + n * c * np.log(2 * np.pi)) + height
+        if demeaned:  # one Gaussian factor per component is integrated out
+            self.constant -= float(np.log(2 * np.pi * self.ladder[0, :, 0]).sum())
+
+    def costs(self, poses: Blocks, stop: float) -> Array:
+        p = self.plane
+        costs: Array = pose_costs(
+            poses, self.demeaned, self.z, self.row, self.column, self.noise, self.least, p.mean_uT, p.variance_uT2,
+            self.heading_cost, self.prior, stop - self.constant,
+        )  # fmt: skip
+        return costs + self.constant
+
+    def bounds(self, blocks: Blocks, level: int, stop: float, samples: int | None = None) -> Array:
+        tree, s = self.plane.pyramid, slice(None, samples)
+        here = slice(int(tree.start[level]), int(tree.start[level] + tree.height[level] * tree.width[level]))
+        bounds: Array = block_bounds(
+            blocks, 1 << level, self.demeaned, self.z[:, s], self.row[:, s], self.column[:, s], self.kind[s],
+            self.ladder, self.log_ladder, 0, tree.height[level], tree.width[level], tree.mean_bounds[here],
+            tree.code_bounds[here], self.heading_cost, self.prior, stop - self.constant,
+        )  # fmt: skip
+        return bounds + self.constant
+
+    def top_blocks(self) -> Blocks:
+        ny, nx = self.plane.shape
+        side = 1 << TOP_LEVEL
+        h, j, i = np.meshgrid(np.arange(self.headings), np.arange(0, ny, side), np.arange(0, nx, side), indexing="ij")
+        return np.stack([h.ravel(), j.ravel(), i.ravel()], axis=1).astype(np.int32)
+
+    def split(self, blocks: Blocks, level: int) -> Blocks:
+        """The blocks of half the side that have cells on the grid."""
+        ny, nx = self.plane.shape
+        half = 1 << (level - 1)
+        corners = np.array([[0, 0, 0], [0, 0, half], [0, half, 0], [0, half, half]], dtype=np.int32)
+        children = (blocks[:, None, :] + corners).reshape(-1, 3)
+        return children[(children[:, 1] < ny) & (children[:, 2] < nx)]
+
+    def cells(self, blocks: Blocks, level: int) -> Array:
+        ny, nx = self.plane.shape
+        side = 1 << level
+        return np.minimum(side, ny - blocks[:, 1]) * np.minimum(side, nx - blocks[:, 2]).astype(np.float64)
+
+
+def search(
+    planes: Sequence[Plane],
+    window: ReducedWindow,
+    headings_rad: Array,
+    prior: PosePrior,
+    *,
+    window_nats: float,
+    temper: float = 1.0,
+    demeaned: bool = False,
+    capacity: int = CAPACITY,
+) -> Candidates:
+    """Every pose of the planes within `window_nats` of the best, tempered by `temper` for the missed mass only."""
+    costs = [_PlaneCosts(plane, window, headings_rad, prior, temper, demeaned) for plane in planes]
+    seeds = [_incumbent(on_plane) for on_plane in costs]
+    sweep = _Sweep(min(cost for _, cost in seeds), 2.0 * window_nats, temper, capacity // len(planes))
+    found = [sweep.run(on_plane, *seed) for on_plane, seed in zip(costs, seeds, strict=True)]
+    plane = np.concatenate([np.full(len(poses), k) for k, (poses, _) in enumerate(found)])
+    poses = np.concatenate([poses for poses, _ in found]).astype(np.int64)
+    cost = np.concatenate([cost for _, cost in found])
+    inside = cost <= sweep.best + sweep.window
+    order = np.flatnonzero(inside)
+    order = order[np.lexsort((poses[order, 2], poses[order, 1], poses[order, 0], plane[order], cost[order]))]
+    sweep.miss(cost[~inside], np.ones(int((~inside).sum())))
+    return Candidates(
+        plane=plane[order],
+        heading=poses[order, 0],
+        row=poses[order, 1],
+        column=poses[order, 2],
+        score=-0.5 * cost[order],
+        window_nats=0.5 * sweep.window,
+        missed_mass=sweep.missed_mass(),
+        poses=len(headings_rad) * sum(p.shape[0] * p.shape[1] for p in planes),
+    )
+
+
+class _Sweep:
+    """Level by level over one plane after the other; the incumbent and the window carry over."""
+
+    def __init__(self, best: float, window: float, temper: float, capacity: int) -> None:
+        self.best, self.window, self.temper, self.capacity = best, window, temper, max(capacity, 1)
+        self._reference, self._missed = best, 0.0
+
+    def run(self, on_plane: _PlaneCosts, seed: Blocks, seed_cost: float) -> tuple[Blocks, Array]:
+        """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
+        blocks = on_plane.top_blocks()
+        for level in range(TOP_LEVEL, 0, -1):
+            bounds = on_plane.bounds(blocks, level, self._stop())
+            keep = self._keep(bounds, _BLOCKS_PER_POSE * self.capacity)
+            self.miss(bounds[~keep], on_plane.cells(blocks[~keep], level))
+            blocks = on_plane.split(blocks[keep], level)
+        seeded = np.flatnonzero((blocks == seed).all(axis=1))
+        blocks = np.concatenate([seed, np.delete(blocks, seeded, axis=0)])
+        costs = on_plane.costs(blocks, self._stop())
+        costs[0] = seed_cost
+        self.best = min(self.best, float(costs.min()))
+        keep = self._keep(costs, self.capacity)
+        keep[np.argmin(costs)] = True
+        self.miss(costs[~keep], np.ones(int((~keep).sum())))
+        return blocks[keep], costs[keep]
+
+    def missed_mass(self) -> float:
+        """What was left out at most, relative to the best pose."""
+        return self._missed * float(np.exp((self.best - self._reference) / (2 * self.temper)))
+
+    def miss(self, bounds: Array, cells: Array) -> None:
+        """Count blocks that are left out, by their bounds."""
+        relative = (bounds - self._reference) / (2.0 * self.temper)
+        near = relative < _NEGLIGIBLE_NATS
+        self._missed += float(np.sum(cells[near] * np.exp(-relative[near])))
+
+    def _stop(self) -> float:
+        return self.best + self.window + 2.0 * self.temper * _SPARE_NATS
+
+    def _keep(self, bounds: Array, room: int) -> NDArray[np.bool_]:
+        """Which to follow: those within the window, which shrinks when they are more than there is room for."""
+        keep = bounds <= self.best + self.window
+        if keep.sum() <= room:
+            return keep
+        self.window = max(float(np.partition(bounds, room)[room]) - self.best, 0.0)
+        chosen = np.flatnonzero(bounds <= self.best + self.window)
+        if len(chosen) > room:  # as good as equal: some of them, evenly
+            chosen = chosen[np.linspace(0, len(chosen) - 1, room).astype(np.int64)]
+        keep[:] = False
+        keep[chosen] = True
+        return keep
+
+
+def _incumbent(on_plane: _PlaneCosts) -> tuple[Blocks, float]:
+    """A good pose (1, 3) and its cost: follow the most promising blocks down."""
+    blocks = on_plane.top_blocks()
+    bounds = on_plane.bounds(blocks, TOP_LEVEL, np.inf, _BEAM_SAMPLES)
+    for level in range(TOP_LEVEL, 0, -1):
+        if len(blocks) > _BEAM:
+            blocks = blocks[np.argpartition(bounds, _BEAM)[:_BEAM]]
+        blocks = on_plane.split(blocks, level)
+        bounds = on_plane.bounds(blocks, level - 1, np.inf) if level > 1 else on_plane.costs(blocks, np.inf)
+    best = int(np.argmin(bounds))
+    return blocks[best : best + 1], float(bounds[best])
+
+
+def _prior_in_cells(plane: Plane, prior: PosePrior, temper: float) -> tuple[Array, float]:
+    """(row, column, cost per squared cell) of the position prior on a plane and the cost of the plane's height."""
+    if prior.position_m is None:
+        return np.zeros(3), 0.0
+    x, y, z = prior.position_m
+    weight = temper / prior.sd_m**2
+    row, column = (y - plane.origin_m[1]) / plane.resolution_m, (x - plane.origin_m[0]) / plane.resolution_m
+    height = weight * (z - plane.height_m) ** 2
+    return np.array([row, column, weight * plane.resolution_m**2]), float(height)
+
+
+def telling_order(window: ReducedWindow, plane: Plane) -> NDArray[np.int64]:
+    """The samples, the most telling first: unlike the ambient field, and far from those already taken."""
+    strength, usual = window.features_uT, plane.ambient_uT
+    if window.turns:
+        strength = np.column_stack([np.hypot(strength[:, 0], strength[:, 1]), strength[:, 2]])
+        usual = np.array([np.hypot(usual[0], usual[1]), usual[2]])
+    unusual = np.linalg.norm(strength - usual, axis=1)
+    unusual /= max(float(unusual.max()), 1e-9)
+    order = [int(np.argmax(unusual))]
+    distance = np.full(len(window), np.inf)
+    for _ in range(len(window) - 1):
+        latest = window.from_last_m[order[-1]]
+        distance = np.minimum(distance, np.linalg.norm(window.from_last_m - latest, axis=1))
+        merit = np.minimum(distance, 4.0) / 4.0 + 0.5 * unusual
+        merit[order] = -1.0
+        order.append(int(np.argmax(merit)))
+    return np.array(order)

@@ -1,0 +1,82 @@
+"""From likelihoods over candidate places to a position: ML, MLR and ABL (Shockley 8.1-8.3), and their gate (8.5).
+
+All three are scale-free: they accept a uniformly bad match, so a chi-square gate goes with them. With correlated errors
+the likelihoods passed in are the tempered ones.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from app.geometry import Array
+
+__all__ = [
+    "ABL_UNIFORM_MULTIPLE", "Bin", "Rival", "best_bin", "chi_square_limit", "likelihood_rival", "log_likelihood",
+    "peak_over_uniform", "section_residuals",
+]  # fmt: skip
+
+ABL_UNIFORM_MULTIPLE = 100.0  # ABL answers when the likeliest cell holds this many times the uniform mass
+
+
+class Rival(NamedTuple):
+    """The best candidate beyond the exclusion radius: its index and log(best / rival)."""
+
+    candidate: int
+    log_ratio: float
+
+
+class Bin(NamedTuple):
+    """The heaviest bin: its mass and the likelihood-weighted mean (row, column) of the cells in it."""
+
+    mass: float
+    row: float
+    column: float
+
+
+def log_likelihood(z_uT: Array, map_uT: Array, sd_uT: Array | float) -> Array:
+    """Log-likelihood without its constant of a measurement (..., N) at each map row (..., N) (Shockley 7.2, L754)."""
+    return np.asarray(-0.5 * np.sum(np.square((z_uT - map_uT) / sd_uT), axis=-1))
+
+
+def section_residuals(section_uT: Array, map_uT: Array, demeaned: bool = False) -> Array:
+    """Residuals (n, c) of a section against a map section, less their means when demeaned (Shockley 8.6)."""
+    residuals = section_uT - map_uT
+    return np.asarray(residuals - residuals.mean(axis=0)) if demeaned else residuals
+
+
+def likelihood_rival(
+    positions_m: Array, planes: NDArray[np.int64], log_l: Array, best: int, min_distance_m: float
+) -> Rival | None:
+    """The strongest candidate at least `min_distance_m` from `best`, or on another plane (Shockley 8.2, L1086)."""
+    apart = np.linalg.norm(positions_m - positions_m[best], axis=1) >= min_distance_m
+    outside = np.flatnonzero(apart | (planes != planes[best]))
+    if not len(outside):
+        return None
+    rival = int(outside[np.argmax(log_l[outside])])
+    return Rival(rival, float(log_l[best] - log_l[rival]))
+
+
+def best_bin(mass: Array, cells: int) -> Bin:
+    """The square of `cells` x `cells` with the most mass (ny, nx) in it, sliding by one cell (Shockley 8.3, L1096)."""
+    rows, columns = min(cells, mass.shape[0]), min(cells, mass.shape[1])
+    table = np.zeros((mass.shape[0] + 1, mass.shape[1] + 1))
+    np.cumsum(np.cumsum(mass, axis=0), axis=1, out=table[1:, 1:])
+    sums = table[rows:, columns:] - table[:-rows, columns:] - table[rows:, :-columns] + table[:-rows, :-columns]
+    j, i = np.unravel_index(int(np.argmax(sums)), sums.shape)
+    inside = mass[j : j + rows, i : i + columns]
+    total = float(inside.sum())
+    row = j + float(inside.sum(axis=1) @ np.arange(rows)) / total
+    column = i + float(inside.sum(axis=0) @ np.arange(columns)) / total
+    return Bin(total, row, column)
+
+
+def peak_over_uniform(mass: Array, cells: int) -> float:
+    """The largest share of the mass as a multiple of 1 / cells: ABL's threshold made scale-free (Shockley 8.5)."""
+    return float(mass.max() / mass.sum() * cells)
+
+
+def chi_square_limit(scalars: float, probability: float) -> float:
+    """The squared Mahalanobis distance that `scalars` independent measurements exceed with 1 - probability."""
+    return float(chi2.ppf(probability, scalars))

@@ -1,0 +1,170 @@
+"""From a belief to an answer: the estimates of the techniques, the posterior's figures, and a plain status."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from app.geometry import Array, wrap_angle_rad
+from app.positioning.belief import Belief, BelievedMode
+from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlEstimate, MlrEstimate, Mode, Posterior, Status
+from app.positioning.matching import Matched
+from app.positioning.posterior import mass_radius, mixture_points
+from app.positioning.techniques import (
+    ABL_UNIFORM_MULTIPLE,
+    best_bin,
+    chi_square_limit,
+    likelihood_rival,
+    peak_over_uniform,
+)
+
+__all__ = ["conclude"]
+
+_CERTAIN = 0.8  # a fix has one mode with at least this probability
+Position = tuple[float, float, float]
+
+
+def conclude(matched: Matched, belief: Belief, techniques: Sequence[str], options: LocateOptions) -> Fix:
+    """Estimates, posterior and status of a belief."""
+    status, reason = _status(matched, belief, options)
+    not_asked = "not asked for"
+    return Fix(
+        status=status,
+        reason=reason,
+        ml=_ml(matched, belief),
+        mlr=_mlr(matched, belief, options) if "mlr" in techniques else MlrEstimate(False, None, reason=not_asked),
+        abl=_abl(matched, belief, options) if "abl" in techniques else AblEstimate(False, reason=not_asked),
+        posterior=_posterior(matched, belief),
+    )
+
+
+def _ml(matched: Matched, belief: Belief) -> MlEstimate:
+    best = belief.best
+    return MlEstimate(
+        _floor_id(matched, best.plane), _position(matched, best.plane, best.pose), _heading(matched, best), best.log_l
+    )
+
+
+def _mlr(matched: Matched, belief: Belief, options: LocateOptions) -> MlrEstimate:
+    found = matched.candidates
+    far = options.mlr_min_distance_m
+    if not _anything_beyond(matched, far):
+        return MlrEstimate(
+            False, None, reason=f"the map ends within {far:g} m of the best match: no rival to compare with"
+        )
+    score = found.score / matched.temper
+    rival = likelihood_rival(matched.position_m, found.plane, score, 0, far)
+    log_ratio = rival.log_ratio if rival else found.window_nats / matched.temper
+    ratio = float(np.exp(min(log_ratio, 700.0)))
+    if not ratio > options.mlr_ratio:
+        reason = f"a place {far:g} m away or more matches nearly as well: ratio {ratio:.2f}, not {options.mlr_ratio:g}"
+        return MlrEstimate(False, ratio, reason=reason)
+    best = belief.best
+    return MlrEstimate(True, ratio, _floor_id(matched, best.plane), _position(matched, best.plane, best.pose))
+
+
+def _abl(matched: Matched, belief: Belief, options: LocateOptions) -> AblEstimate:
+    found, mass = matched.candidates, belief.lattice_mass
+    strongest, winner, lead = None, 0, -1.0
+    peak, cells = 0.0, sum(plane.shape[0] * plane.shape[1] for plane in matched.planes)
+    for k in np.unique(found.plane):
+        here, plane = found.plane == k, matched.planes[k]
+        row0, column0 = found.row[here].min(), found.column[here].min()
+        table = np.zeros((found.row[here].max() - row0 + 1, found.column[here].max() - column0 + 1))
+        np.add.at(table, (found.row[here] - row0, found.column[here] - column0), mass[here])
+        peak = max(peak, float(table.max()))
+        held = best_bin(table, max(round(options.abl_bin_m / plane.resolution_m), 1))
+        if held.mass > lead:
+            lead, winner = held.mass, int(k)
+            strongest = (column0 + held.column, row0 + held.row)
+    threshold = ABL_UNIFORM_MULTIPLE if options.abl_threshold is None else options.abl_threshold
+    multiple = peak_over_uniform(np.array([peak, 1.0 - peak]), cells)
+    if multiple < threshold or strongest is None:
+        reason = f"the likelihood is spread out: its peak is {multiple:.3g} times the uniform share, not {threshold:g}"
+        return AblEstimate(False, lead, reason=reason)
+    plane = matched.planes[winner]
+    x, y = (o + plane.resolution_m * k for o, k in zip(plane.origin_m, strongest, strict=True))
+    return AblEstimate(True, lead, _floor_id(matched, winner), (float(x), float(y), plane.height_m))
+
+
+def _posterior(matched: Matched, belief: Belief) -> Posterior:
+    ids = [floor.floor_id for floor in matched.floors]
+    floor_of = matched.plane_floor[belief.atoms.plane]
+    probability = np.bincount(floor_of, weights=belief.atoms.mass, minlength=len(ids))
+    strongest = int(np.argmax(probability))
+    top = next(mode for mode in belief.modes if matched.plane_floor[mode.plane] == strongest)
+    points, mass = mixture_points(belief.atoms.on(floor_of == strongest))
+    centre = _mode_mean(points, mass, top.pose[:2])
+    r68, r95 = mass_radius(points, mass, centre, (0.68, 0.95))
+    off = points - centre
+    return Posterior(
+        floor_probability={floor_id: float(p) for floor_id, p in zip(ids, probability, strict=True)},
+        floor_id=ids[strongest],
+        position_m=_position(matched, top.plane, centre),
+        covariance_m2=np.asarray((mass * off.T) @ off / mass.sum()),
+        radius_68_m=r68,
+        radius_95_m=r95,
+        modes=tuple(
+            Mode(
+                _floor_id(matched, mode.plane), _position(matched, mode.plane, mode.pose), _heading(matched, mode),
+                mode.probability,
+            )
+            for mode in belief.modes
+        ),
+        off_map_probability=belief.off_map,
+        missed_probability=belief.missed,
+    )  # fmt: skip
+
+
+def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[Status, str | None]:
+    unmapped = belief.off_map + (1.0 - belief.off_map) * belief.half_measured
+    if unmapped > 0.5:
+        return "unmapped", (
+            f"the window fits ground without a map at least as well (probability {unmapped:.2f}); walk on into mapped "
+            "corridors, or survey where this was recorded"
+        )
+    scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if matched.demeaned else 0)
+    distance2 = belief.best.distance2 / matched.temper
+    limit = chi_square_limit(scalars / matched.temper, options.gate_probability)
+    if distance2 > limit:
+        return "inconsistent", (
+            f"even the best match is worse than chance allows (chi-square {distance2:.1f}, limit {limit:.1f}); check "
+            "units, frame and calibration, or whether the building changed since the survey; composition demeaned "
+            "removes an offset"
+        )
+    strongest = belief.modes[0].probability
+    if strongest < _CERTAIN:
+        return "ambiguous", (
+            f"the strongest place holds only {strongest:.2f} of the probability; walk further, turn a corner, or send "
+            "a prior position or heading"
+        )
+    return "fix", None
+
+
+def _mode_mean(points_m: Array, mass: Array, peak_m: Array) -> Array:
+    """Mean of the mass about a peak: within the radius that keeps the mode apart from others, itself if nothing is."""
+    near = np.linalg.norm(points_m - peak_m, axis=1) < 2.0
+    return np.asarray(mass[near] @ points_m[near] / mass[near].sum()) if near.any() else peak_m
+
+
+def _anything_beyond(matched: Matched, distance_m: float) -> bool:
+    best = matched.candidates.plane[0]
+    if len(matched.planes) > 1:
+        return True
+    plane = matched.planes[best]
+    extent = plane.resolution_m * (np.array(plane.shape[::-1]) - 1)
+    from_origin = matched.position_m[0] - np.array(plane.origin_m)
+    return bool(np.linalg.norm(np.maximum(from_origin, extent - from_origin)) >= distance_m)
+
+
+def _floor_id(matched: Matched, plane: int) -> str:
+    return matched.floors[int(matched.plane_floor[plane])].floor_id
+
+
+def _position(matched: Matched, plane: int, pose: Array) -> Position:
+    return float(pose[0]), float(pose[1]), matched.planes[plane].height_m
+
+
+def _heading(matched: Matched, mode: BelievedMode) -> float | None:
+    if matched.device_turn_rad is None:
+        return None
+    return float(wrap_angle_rad(mode.pose[2] + matched.device_turn_rad))
