@@ -10,10 +10,9 @@ from rich.table import Table
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.db.engine import create_database_engine, session_factory
+from app.db.engine import create_database_engine, migrate, session_factory
 from app.db.tables import Key, Organisation
 from app.errors import IsodynError
-from app.main import first_start
 from app.services.manage_keys import SCOPES, create_key, revoke_key
 from app.settings import Settings
 
@@ -25,8 +24,9 @@ commands = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=T
 @contextmanager
 def _database() -> Iterator[Session]:
     settings = Settings()
-    first_start(settings)
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
     engine = create_database_engine(settings.resolved_database_url)
+    migrate(engine)
     try:
         with session_factory(engine).begin() as session:
             yield session
