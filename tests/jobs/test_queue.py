@@ -1,38 +1,15 @@
 """Asking for work: atomic with the caller's rows, one waiting rebuild per floor, on both databases."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from uuid import uuid4
 
 import pytest
 from sqlalchemy import Engine, func, select, text
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.db.tables import Building, Floor, Job, Map, Organisation
+from app.db.tables import Floor, Job, Map
 from app.errors import NotFound
 from app.jobs import JobQueue
 from app.jobs.queue import claim_generation
-
-
-@pytest.fixture
-def queue(engine: Engine) -> Iterator[JobQueue]:
-    queue = JobQueue(engine)
-    yield queue
-    queue.close()
-
-
-@pytest.fixture
-def floor(sessions: sessionmaker[Session]) -> Floor:
-    with sessions.begin() as session:
-        organisation = Organisation(name=f"organisation {uuid4()}")
-        session.add(organisation)
-        session.flush()
-        building = Building(organisation_id=organisation.id, name="b")
-        session.add(building)
-        session.flush()
-        floor = Floor(organisation_id=organisation.id, building_id=building.id, name="f", ordinal=0, elevation_m=0.0)
-        session.add(floor)
-    return floor
 
 
 def a_map(session: Session, floor: Floor) -> Map:

@@ -1,0 +1,102 @@
+"""A builder without mathematics for the worker's tests: sleeps in slices, and writes a diary beside the blobs.
+
+What a fit does is said by the map's spec or, for rebuilds, by the floor's name: a JSON object with `sleep_s`, `fail`,
+`die_times`, `silent`.
+"""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from app.blobs import BlobStore, FolderBlobStore
+from app.db.tables import Floor, Job, Map, Survey
+from app.errors import InvalidInput
+
+DIARY = Path(os.environ["ISODYN_TEST_DIARY"])
+
+
+def note(event: str, **facts: object) -> None:
+    line = json.dumps({"event": event, "at": time.time(), "pid": os.getpid(), **facts}) + "\n"
+    with DIARY.open("a") as diary:
+        diary.write(line)
+
+
+def claim_build(session: Session, job_id: str) -> dict[str, Any]:
+    job = session.get_one(Job, job_id)
+    floor = session.get_one(Floor, job.floor_id, populate_existing=True)
+    row = session.get(Map, job.map_id) if job.map_id else None
+    if row is None:
+        row = Map(
+            organisation_id=job.organisation_id,
+            floor_id=floor.id,
+            status="running",
+            spec={},
+            survey_ids=[],
+            activate=True,
+        )
+        session.add(row)
+        session.flush()
+        job.map_id = row.id
+    if row.sequence == 0:
+        floor.build_sequence += 1
+        row.sequence = floor.build_sequence
+        row.survey_ids = list(session.scalars(select(Survey.id).where(Survey.floor_id == floor.id)))
+    job.status = row.status = "running"
+    job.started_at = datetime.now(UTC)
+    orders = {**json.loads(floor.name), **row.spec}
+    if orders.get("fail_claim"):
+        raise InvalidInput("there is nothing to build; upload a survey")
+    return {"map_id": row.id, "floor_id": floor.id, "sequence": row.sequence, "surveys": row.survey_ids, **orders}
+
+
+def fit_build(plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None]) -> dict[str, Any]:
+    note("fit starts", floor_id=plan["floor_id"], map_id=plan["map_id"], surveys=plan["surveys"])
+    assert isinstance(blobs, FolderBlobStore)
+    if plan.get("fail"):
+        raise InvalidInput("the walks do not overlap; walk the floor again")
+    if plan.get("break"):
+        raise ZeroDivisionError("a fault of the program")
+    started = sum(e["event"] == "fit starts" and e["map_id"] == plan["map_id"] for e in map(json.loads, open(DIARY)))  # noqa: PTH123, SIM115
+    if started <= plan.get("die_times", 0):
+        os.kill(os.getpid(), signal.SIGKILL)
+    slices = max(1, round(plan.get("sleep_s", 0.2) / 0.05))
+    for n in range(slices):
+        if not plan.get("silent"):
+            progress(n / slices, f"slice {n} of {slices}")
+        time.sleep(0.05)
+    sha256 = blobs.put(json.dumps(sorted(plan["surveys"])).encode())
+    note("fit ends", floor_id=plan["floor_id"], map_id=plan["map_id"])
+    return {"sha256": sha256}
+
+
+def publish_build(session: Session, job_id: str, plan: dict[str, Any], result: dict[str, Any]) -> None:
+    row, job = session.get_one(Map, plan["map_id"]), session.get_one(Job, job_id)
+    newer = update(Floor).where(Floor.id == plan["floor_id"], Floor.active_sequence < plan["sequence"])
+    session.execute(newer.values(active_map_id=row.id, active_sequence=plan["sequence"]))
+    row.status, row.grid_sha256 = "ready", result["sha256"]
+    job.status, job.progress, job.message, job.result = "successful", 100, "the map is ready", result
+    job.finished_at = datetime.now(UTC)
+
+
+def fail_build(session: Session, job_id: str, message: str) -> None:
+    _end(session, job_id, "failed", message)
+
+
+def dismiss_build(session: Session, job_id: str) -> None:
+    _end(session, job_id, "dismissed", "cancelled")
+
+
+def _end(session: Session, job_id: str, status: str, message: str) -> None:
+    job = session.get_one(Job, job_id)
+    if job.status in ("successful", "failed", "dismissed"):
+        return
+    job.status, job.message, job.finished_at = status, message, datetime.now(UTC)
+    note("ended", status=status)

@@ -1,0 +1,132 @@
+"""A worker process, from start to end.
+
+It stops in three ways. Asked (SIGTERM, SIGINT, or its parent gone): it takes nothing new, gives running jobs a bounded
+time, and leaves what is unfinished to be taken over at once. Fenced (its lease is lost): it ends on the spot. Killed:
+the others notice when its lease runs out.
+"""
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from math import ceil
+from types import FrameType
+from uuid import uuid4
+
+from dbos import DBOS, DBOSClient
+from sqlalchemy import Engine
+from sqlalchemy.exc import SQLAlchemyError
+
+from app.db.engine import create_database_engine, migrate, session_factory
+from app.jobs.engine import QUEUE, engine_configuration, open_client
+from app.jobs.lease import Lease
+from app.settings import Settings
+from workers.builder import DEFAULT_BUILDER, load_builder
+from workers.janitor import hand_over
+from workers.reconcile import close_abandoned_jobs, has_unfinished_jobs
+from workers.workflows import WorkflowContext, register_workflows
+
+__all__ = ["run_worker"]
+
+POLL_S = 0.25
+FENCED = 3
+
+log = logging.getLogger(__name__)
+
+
+def run_worker(
+    settings: Settings,
+    *,
+    builder: str = DEFAULT_BUILDER,
+    lease_ttl_s: float = 30.0,
+    drain_s: float = 10.0,
+    exit_with_parent: bool = False,
+) -> None:
+    """Take jobs from the database until asked to stop; call it in the main thread.
+
+    `builder` is the module that does the work (`workers.builder.Builder`). A worker that falls silent for
+    `lease_ttl_s` is dead to the others. Running jobs get `drain_s` to finish when the worker is asked to stop.
+    """
+    stop = _stop_on_signals()
+    url = settings.resolved_database_url
+    migrate(url)
+    engine = create_database_engine(url)
+    client = open_client(engine)
+    context = WorkflowContext(session_factory(engine), settings.resolved_blob_url, load_builder(builder), builder)
+    register_workflows(context)
+    lease = Lease(engine, f"{socket.gethostname()[:60]}-{os.getpid()}-{uuid4().hex[:12]}", lease_ttl_s)
+    lease.start()
+    _start_thread("fence", _end_when_lost, lease)
+    _launch(engine, lease.worker_id, settings.worker_processes)
+    _start_thread("reaper", _reap_until, stop, url, lease, client, context)
+    parent_died = _wait(stop, os.getppid() if exit_with_parent else None)
+    _leave(lease, client, 0.0 if parent_died else drain_s)
+    engine.dispose()
+
+
+def _stop_on_signals() -> threading.Event:
+    stop = threading.Event()
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, ask)
+    return stop
+
+
+def _start_thread(name: str, target: Callable[..., None], *arguments: object) -> None:
+    threading.Thread(target=target, args=arguments, name=name, daemon=True).start()
+
+
+def _launch(engine: Engine, worker_id: str, fits_at_one_time: int) -> None:
+    DBOS(config=engine_configuration(engine.url, worker_id))
+    DBOS.launch()
+    # The queue's row is shared: of workers set differently, the one that started last decides for all.
+    DBOS.register_queue(
+        QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=POLL_S
+    )
+
+
+def _end_when_lost(lease: Lease) -> None:
+    while True:
+        time.sleep(lease.ttl_s / 8)
+        if lease.is_lost:
+            log.error("worker %s lost its lease and ends: others may hold its jobs", lease.worker_id)
+            os._exit(FENCED)
+
+
+def _reap_until(stop: threading.Event, url: str, lease: Lease, client: DBOSClient, context: WorkflowContext) -> None:
+    while True:
+        try:
+            for dead_id in lease.take_over_from_dead():
+                if has_unfinished_jobs(client, dead_id):
+                    log.warning("worker %s died; its jobs go back to their queue", dead_id)
+                    hand_over(url, dead_id)
+                lease.bury(dead_id)
+            close_abandoned_jobs(client, context)
+        except (SQLAlchemyError, subprocess.SubprocessError):
+            log.exception("could not look after dead workers; trying again")
+        if stop.wait(lease.ttl_s / 2):
+            return
+
+
+def _wait(stop: threading.Event, parent: int | None) -> bool:
+    """Until asked to stop; True if the reason is that the parent died."""
+    while not stop.wait(0.5):
+        if parent is not None and os.getppid() != parent:
+            return True
+    return False
+
+
+def _leave(lease: Lease, client: DBOSClient, drain_s: float) -> None:
+    """Take nothing new, let running jobs finish, and leave the rest to the others."""
+    DBOS.destroy(workflow_completion_timeout_sec=ceil(drain_s))
+    unfinished = has_unfinished_jobs(client, lease.worker_id)
+    lease.release(unfinished=unfinished)
+    if unfinished:
+        os._exit(0)  # the threads of unfinished jobs must not go on: their jobs are somebody else's now

@@ -1,0 +1,172 @@
+"""The workflows: claim what to build, fit it in a child process, publish it.
+
+Steps are recorded by the engine: after a crash those that ended are not run again, the one in the middle is. Their
+order and names never change (docs/decisions/0003); a workflow that must differ gets a new name beside the old one.
+Whatever ends a step on purpose is in its outcome, because an exception comes back from the record as another type:
+`plan`, `result` or `published` when it went well, else `skipped`, `cancelled` or `failed` (with a message).
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ParamSpec, TypeVar
+
+from dbos import DBOS
+from dbos import error as dbos_error
+from sqlalchemy import select
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.db.tables import Job
+from app.errors import IsodynError, JobCancelled, NotFound
+from app.jobs.engine import BUILD, REBUILD
+from app.jobs.progress import JobReporter
+from app.jobs.queue import FINAL_STATES, claim_generation, lock_floor
+from workers.builder import Builder, Plan, Result
+from workers.fit_process import FitFailed, FitProcessDied, run_fit
+
+__all__ = ["WorkflowContext", "register_workflows"]
+
+FIT_ATTEMPTS = 3
+DATABASE_ATTEMPTS = 8  # a second, two, four ...: two minutes in all
+MOST_RECOVERIES = 10  # a job that takes its worker down with it must not do so for ever
+
+Outcome = dict[str, Any]
+P = ParamSpec("P")
+R = TypeVar("R")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class WorkflowContext:
+    """What the steps work with. `builder` is the module `builder_name`; the fit's child process imports it anew."""
+
+    sessions: sessionmaker[Session]
+    blob_url: str
+    builder: Builder
+    builder_name: str
+
+
+def register_workflows(context: WorkflowContext) -> None:
+    """Make the workflows known to the engine of this process; before it is launched."""
+    steps = _Steps(context)
+    claim = _step(steps.claim, DATABASE_ATTEMPTS)
+    fit = _step(steps.fit, FIT_ATTEMPTS)
+    publish = _step(steps.publish, DATABASE_ATTEMPTS)
+    close = _step(steps.close, DATABASE_ATTEMPTS)
+
+    def run(workflow_id: str, generation: int) -> str:
+        try:
+            outcome = claim(workflow_id, generation)
+            if "plan" in outcome:
+                plan = outcome["plan"]
+                outcome = fit(workflow_id, plan)
+                if "result" in outcome:
+                    outcome = publish(workflow_id, plan, outcome["result"])
+        except Exception as error:
+            log.exception("%s stopped", workflow_id)
+            outcome = {"failed": _describe(error)}
+        if "failed" in outcome or "cancelled" in outcome:
+            close(workflow_id, generation, outcome)
+        return ", ".join(outcome)
+
+    @DBOS.workflow(name=REBUILD, max_recovery_attempts=MOST_RECOVERIES)
+    def rebuild(floor_id: str, generation: int) -> str:
+        return run(f"{REBUILD}:{floor_id}:{generation}", generation)
+
+    @DBOS.workflow(name=BUILD, max_recovery_attempts=MOST_RECOVERIES)
+    def build(map_id: str) -> str:
+        return run(f"{BUILD}:{map_id}", 0)
+
+
+class _Steps:
+    """The steps. `generation` is 0 for a build of a given map. Each locks the floor before it looks at the job."""
+
+    def __init__(self, context: WorkflowContext) -> None:
+        self._context = context
+
+    def claim(self, workflow_id: str, generation: int) -> Outcome:
+        """From here on uploads ask for the next generation, and this one sees all that came before."""
+        try:
+            with self._context.sessions.begin() as session:
+                job = _locked_job(session, workflow_id)
+                if job.status in FINAL_STATES:
+                    return {"skipped": job.status}
+                if job.cancel_requested:
+                    return {"cancelled": True}
+                claim_generation(session, job.floor_id, generation)
+                return {"plan": self._context.builder.claim_build(session, job.id)}
+        except IsodynError as error:
+            return {"failed": str(error)}
+
+    def fit(self, workflow_id: str, plan: Plan) -> Outcome:
+        with self._context.sessions() as session:
+            job_id = session.scalar(select(Job.id).where(Job.workflow_id == workflow_id))
+        if job_id is None:
+            return {"cancelled": True}
+        reporter = JobReporter(self._context.sessions, job_id, still_owner=_stop_unless_owner)
+        try:
+            return {"result": run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)}
+        except JobCancelled:
+            return {"cancelled": True}
+        except FitFailed as error:
+            return {"failed": str(error)}
+
+    def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
+        _stop_unless_owner(100)
+        try:
+            with self._context.sessions.begin() as session:
+                job = _locked_job(session, workflow_id)
+                self._context.builder.publish_build(session, job.id, plan, result)
+            return {"published": True}
+        except IsodynError as error:
+            return {"failed": str(error)}
+
+    def close(self, workflow_id: str, generation: int, outcome: Outcome) -> None:
+        """Give the job its last state. A floor or a job that is gone needs none."""
+        try:
+            with self._context.sessions.begin() as session:
+                job = _locked_job(session, workflow_id)
+                claim_generation(session, job.floor_id, generation)
+                if "cancelled" in outcome:
+                    self._context.builder.dismiss_build(session, job.id)
+                else:
+                    self._context.builder.fail_build(session, job.id, outcome["failed"])
+        except NotFound as error:
+            log.info("%s: nothing to close: %s", workflow_id, error)
+
+
+def _step(method: Callable[P, R], attempts: int) -> Callable[P, R]:
+    def step(*args: P.args, **kwargs: P.kwargs) -> R:  # the engine marks functions, and cannot mark methods
+        return method(*args, **kwargs)
+
+    return DBOS.step(
+        name=method.__name__,
+        retries_allowed=True,
+        max_attempts=attempts,
+        interval_seconds=1.0,
+        backoff_rate=2.0,
+        should_retry=lambda error: isinstance(error, (DBAPIError, FitProcessDied)),
+    )(step)
+
+
+def _stop_unless_owner(progress: int) -> None:
+    """The engine ends this execution here if the job was given to another worker meanwhile."""
+    DBOS.set_event("progress", progress)
+
+
+def _locked_job(session: Session, workflow_id: str) -> Job:
+    job = session.scalar(select(Job).where(Job.workflow_id == workflow_id))
+    if job is None:
+        raise NotFound(f"no job for {workflow_id}")
+    lock_floor(session, job.floor_id)
+    session.refresh(job)
+    return job
+
+
+def _describe(error: Exception) -> str:
+    last = error.errors[-1] if isinstance(error, dbos_error.DBOSMaxStepRetriesExceeded) and error.errors else error
+    if isinstance(last, FitProcessDied):
+        return f"{last}, {FIT_ATTEMPTS} times; give the worker more memory, or build from fewer surveys"
+    return f"internal error ({type(last).__name__}: {last}); the worker's log has its trace"
