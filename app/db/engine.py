@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from app.errors import InvalidInput
 
-__all__ = ["create_database_engine", "downgrade", "migrate", "session_factory"]
+__all__ = ["create_database_engine", "downgrade", "migrate", "migration_state", "session_factory"]
 
 BUSY_TIMEOUT_S = 30.0
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
@@ -62,6 +62,19 @@ def downgrade(database: Engine | str, revision: str = "base") -> None:
     """Take our schema back to `revision`; the job engine's own tables stay."""
     with _engine_of(database) as engine, _migration_lock(engine):
         _run_alembic(engine, "downgrade", revision)
+
+
+def migration_state(engine: Engine) -> tuple[str | None, str | None]:
+    """The revision our schema is at, and the newest one this version knows."""
+    from alembic.config import Config
+    from alembic.runtime.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+
+    config = Config()
+    config.set_main_option("script_location", str(resources.files("migrations")).replace("%", "%%"))
+    with engine.connect() as connection:
+        at = MigrationContext.configure(connection).get_current_revision()
+    return at, ScriptDirectory.from_config(config).get_current_head()
 
 
 def _checked(url: str) -> URL:
