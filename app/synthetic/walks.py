@@ -16,7 +16,8 @@ _FINE_M = 0.05  # spacing of the path before it is sampled in time
 _STRIDE_M = 0.7
 _BOB_M = 0.02
 _PACE_SPREAD = 0.05
-_SHARPEST_TURN = float(np.cos(np.deg2rad(110.0)))  # nobody turns on the spot
+_CHOICES = 3
+_TURN_S = 0.25  # the device turns with the person, not at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,15 +71,17 @@ def random_waypoints(
     x0, y0, x1, y1 = building.walkable_m
     shortest_leg_m = min(4.0, 0.4 * max(x1 - x0, y1 - y0))
     corners = [rng.uniform([x0, y0], [x1, y1])]
+    before = rng.normal(size=2)
     walked_m = 0.0
     while walked_m < 1.1 * length_m + 2.0:  # rounding the turns shortens the path
-        following = rng.uniform([x0, y0], [x1, y1])
-        leg = following - corners[-1]
-        leg_m = float(np.linalg.norm(leg))
-        before = corners[-1] - corners[-2] if len(corners) > 1 else leg
-        if leg_m >= shortest_leg_m and leg @ before > _SHARPEST_TURN * leg_m * np.linalg.norm(before):
-            corners.append(following)
-            walked_m += leg_m
+        legs = rng.uniform([x0, y0], [x1, y1], size=(_CHOICES, 2)) - corners[-1]
+        legs_m = np.linalg.norm(legs, axis=1)
+        ahead = np.where(legs_m >= shortest_leg_m, legs @ before / legs_m, -np.inf)
+        chosen = int(np.argmax(ahead))  # of a few places, the one most nearly ahead: people rarely turn round
+        if np.isfinite(ahead[chosen]):
+            before = legs[chosen]
+            corners.append(corners[-1] + before)
+            walked_m += float(legs_m[chosen])
     return _walk(building, floor, rng, np.array(corners), 0.7, speed_m_s, rate_hz)
 
 
@@ -100,6 +103,7 @@ def _walk(
     p = np.stack([np.interp(walked, s, xy[:, 0]), np.interp(walked, s, xy[:, 1])], axis=1)
     tangent = np.gradient(xy, axis=0)
     heading = np.interp(walked, s, np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])))
+    heading = gaussian_filter1d(heading, _TURN_S * rate_hz, mode="nearest")
     bob = _BOB_M * np.sin(2 * np.pi * walked / _STRIDE_M + rng.uniform(0.0, 2 * np.pi))
     z = building.elevations_m[floor] + DEVICE_HEIGHT_M + bob + ornstein_uhlenbeck(rng, t, 0.01, 5.0)[:, 0]
     return SyntheticWalk(floor, t, np.column_stack([p, z]), wrap_angle_rad(heading))

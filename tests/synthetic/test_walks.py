@@ -38,6 +38,7 @@ def test_random_walk_is_walked_like_a_person(building: SyntheticBuilding, rng: n
     assert np.abs(turn).max() < 2 * np.pi
     along = np.cos(np.arctan2(step[:, 1], step[:, 0]) - walk.heading_rad[:-1])
     assert np.median(along) > 0.999
+    assert np.mean(along > 0.9) > 0.95
     height = walk.p_building_m[:, 2] - building.elevations_m[1]
     assert height.mean() == pytest.approx(1.2, abs=0.03)
     assert 0.01 < height.std() < 0.04
