@@ -13,17 +13,21 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="ISODYN_", extra="ignore")
 
-    data_dir: Path = Field(Path("./var"), description="folder of the database and the blobs")
-    database_url: str | None = Field(None, description="default: SQLite in the data folder; or postgresql+psycopg://")
-    blob_url: str | None = Field(None, description="default: a folder in the data folder; a file:// address")
-    admin_key: str | None = Field(None, description="the admin key; else one is made at first start and printed once")
-    host: str = Field("127.0.0.1", description="address to listen on")
-    port: int = Field(8300, ge=0, le=65535, description="port to listen on; 0 picks a free one")
-    max_upload_bytes: int = Field(64 * 2**20, description="largest survey body, before and after decompression")
-    max_body_bytes: int = Field(4 * 2**20, description="largest JSON body")
-    max_window_samples: int = Field(2000, description="most samples in one window")
-    grid_cache_bytes: int = Field(512 * 2**20, description="memory for maps held ready to answer")
-    worker_processes: int = Field(1, ge=1, description="child processes fitting maps at one time, per worker")
+    data_dir: Path = Field(default=Path("./var"), description="folder of the database and the blobs")
+    database_url: str | None = Field(
+        default=None, description="default: SQLite in the data folder; or postgresql+psycopg://"
+    )
+    blob_url: str | None = Field(default=None, description="default: a folder in the data folder; a file:// address")
+    admin_key: str | None = Field(
+        default=None, description="the admin key; else one is made at first start and printed once"
+    )
+    host: str = Field(default="127.0.0.1", description="address to listen on")
+    port: int = Field(default=8300, ge=1, le=65535, description="port to listen on")
+    max_upload_bytes: int = Field(default=64 * 2**20, description="largest survey body, before and after decompression")
+    max_body_bytes: int = Field(default=4 * 2**20, description="largest JSON body")
+    max_window_samples: int = Field(default=2000, description="most samples in one window")
+    grid_cache_bytes: int = Field(default=512 * 2**20, description="memory for maps held ready to answer")
+    worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
 
     @property
     def resolved_database_url(self) -> str:

@@ -1,7 +1,7 @@
 """Lists by opaque cursor: `{"items": [...], "links": {"next"?: ...}}`, oldest first."""
 
 from base64 import urlsafe_b64decode, urlsafe_b64encode
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Depends, Query, Request
@@ -42,7 +42,7 @@ PagingDep = Annotated[Paging, Depends()]
 
 def list_page(
     session: Session,
-    statement: Select[tuple[Row]],
+    statement: Select[Row],
     id_column: InstrumentedAttribute[str],
     paging: Paging,
     show: Callable[[Row], Item],
@@ -50,11 +50,11 @@ def list_page(
     """One page of the statement's rows in order of id, which is the order of creation."""
     if paging.after is not None:
         statement = statement.where(id_column > paging.after)
-    rows = session.scalars(statement.order_by(id_column).limit(paging.limit + 1)).all()
+    rows: Sequence[Any] = session.scalars(statement.order_by(id_column).limit(paging.limit + 1)).all()
     links = {}
     if len(rows) > paging.limit:
-        last: Any = rows[paging.limit - 1]
-        url = paging.url.include_query_params(cursor=urlsafe_b64encode(last.id.encode()).decode())
+        last = rows[paging.limit - 1].id
+        url = paging.url.include_query_params(cursor=urlsafe_b64encode(last.encode()).decode())
         links["next"] = f"{url.path}?{url.query}"
     return Page[Any](items=[show(row) for row in rows[: paging.limit]], links=links)
 

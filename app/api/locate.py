@@ -1,7 +1,7 @@
 """Where am I? A window of magnetometer samples in, a fix out. Nothing is written, nothing queued."""
 
 from time import perf_counter
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from fastapi import APIRouter
@@ -31,7 +31,7 @@ Quaternion = Annotated[list[Annotated[Finite, Field(ge=-2, le=2)]], Field(min_le
 Radians = Annotated[float, Field(allow_inf_nan=False, ge=-100.0, le=100.0)]
 FloorId = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]
 
-_EXAMPLE = {
+_EXAMPLE: dict[str, Any] = {
     "window": {
         "frame": "level",
         "b_ut": [[19.8, 2.1, -43.0], [19.1, 2.6, -43.4], [18.2, 3.0, -44.1]],
@@ -281,7 +281,7 @@ def show_fix(fix: Fix, techniques: list[Literal["ml", "mlr", "abl"]], map_ids: l
     )
 
 
-def _fields(value: object) -> dict[str, object]:
+def _fields(value: object) -> dict[str, Any]:
     """The fields of a frozen, slotted dataclass, tuples as lists."""
     fields = {name: getattr(value, name) for name in value.__slots__}  # type: ignore[attr-defined]
     return {name: list(field) if isinstance(field, tuple) else field for name, field in fields.items()}

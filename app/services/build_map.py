@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Any, cast
+from typing import Any
 
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
@@ -40,15 +40,12 @@ def claim_build(session: Session, job_id: str) -> Plan:
         session.flush()
         job.map_id = map_row.id
     if map_row.sequence == 0:
-        map_row.sequence = cast(
-            int,
-            session.execute(
-                update(Floor)
-                .where(Floor.id == job.floor_id)
-                .values(build_sequence=Floor.build_sequence + 1)
-                .returning(Floor.build_sequence)
-            ).scalar_one(),
-        )
+        map_row.sequence = session.execute(
+            update(Floor)
+            .where(Floor.id == job.floor_id)
+            .values(build_sequence=Floor.build_sequence + 1)
+            .returning(Floor.build_sequence)
+        ).scalar_one()
         map_row.survey_ids = _wanted_surveys(session, job.floor_id, map_row)
     map_row.status = job.status = "running"
     job.started_at = job.started_at or now

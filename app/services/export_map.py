@@ -67,6 +67,7 @@ def _csv(grid: FieldGrid) -> bytes:
 def _netcdf(grid: FieldGrid) -> bytes:
     z, y, x = _axes(grid)
     out = io.BytesIO()
+    file: Any
     with netcdf_file(out, "w", version=2) as file:
         file.Conventions, file.title = "CF-1.10", "Isodyn magnetic field map"
         for name, values, axis in (("z", z, "Z"), ("y", y, "Y"), ("x", x, "X")):

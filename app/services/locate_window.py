@@ -53,7 +53,7 @@ def active_maps(
     rows = session.execute(statement).all()
     for missing in sorted(set(floor_ids or ()) - {row[0] for row in rows}):
         raise NotFound(f"no floor {missing}" + (" in this building" if building_id else ""))
-    return [ActiveMap(*row) for row in rows if row[1] is not None]
+    return [ActiveMap(floor_id, map_id, sha256) for floor_id, map_id, sha256 in rows if map_id and sha256]
 
 
 def locate_window(

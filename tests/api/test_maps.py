@@ -1,0 +1,163 @@
+"""Maps over HTTP: parameters, the field at points, files, pictures, activation."""
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import netcdf_file
+
+
+def test_the_field_at_points_is_the_true_field_and_never_invented(
+    service: Any, active_map: str, true_field_uT: Callable[..., np.ndarray]
+) -> None:
+    points = [[2.0, 2.0, 1.2], [6.3, 4.1, 9.9], [500.0, 0.0, 1.2], [-40.0, -40.0, 0.0]]
+    answer = service.http.post(f"/v1/maps/{active_map}/field", json={"points_m": points, "gradient": True}).json()
+    assert answer["measured"] == [True, True, False, False]
+    assert answer["components"] == ["bx", "by", "bz"]
+    assert answer["mean_ut"][2:] == [None, None]
+    assert answer["gradient_ut_per_m"][2] is None
+    assert answer["points_m"] == points
+    truth = true_field_uT(np.array([2.0, 6.3]), np.array([2.0, 4.1]))
+    np.testing.assert_allclose(answer["mean_ut"][:2], truth, atol=1.0)
+    step = 1e-3
+    dx = (true_field_uT(np.array([2.0 + step]), np.array([2.0])) - truth[0]) / step
+    np.testing.assert_allclose(np.array(answer["gradient_ut_per_m"][0], dtype=float)[:, 0], dx[0], atol=1.5)
+    assert answer["gradient_ut_per_m"][0][0][2] is None
+
+
+@pytest.mark.parametrize("format", ["netcdf", "npz", "csv", "covjson"])
+def test_every_export_carries_the_same_field_and_a_strong_etag(service: Any, active_map: str, format: str) -> None:
+    answer = service.http.get(f"/v1/maps/{active_map}/export", params={"format": format})
+    assert answer.status_code == 200
+    etag = answer.headers["etag"]
+    assert service.http.get(f"/v1/maps/{active_map}").json()["sha256"] in etag
+    assert "immutable" in answer.headers["cache-control"]
+    unchanged = service.http.get(
+        f"/v1/maps/{active_map}/export", params={"format": format}, headers={"If-None-Match": etag}
+    )
+    assert unchanged.status_code == 304
+    assert unchanged.content == b""
+    again = service.http.get(f"/v1/maps/{active_map}/export", params={"format": format})
+    assert again.content == answer.content
+    x, y, bx = _read(format, answer.content)
+    asked = service.http.post(f"/v1/maps/{active_map}/field", json={"points_m": [[x, y, 1.2]]}).json()
+    assert asked["mean_ut"][0][0] == pytest.approx(bx, abs=2e-3)
+
+
+def _read(format: str, data: bytes) -> tuple[float, float, float]:
+    """One measured cell of an export: x, y, bx."""
+    if format == "csv":
+        rows = data.decode().splitlines()
+        assert rows[0].startswith("x_m,y_m,z_m,bx_ut")
+        cells = rows[len(rows) // 2].split(",")
+        return float(cells[0]), float(cells[1]), float(cells[3])
+    if format == "covjson":
+        coverage = json.loads(data)
+        shape, axes = coverage["ranges"]["bx_ut"]["shape"], coverage["domain"]["axes"]
+        values = np.array(coverage["ranges"]["bx_ut"]["values"], dtype=float).reshape(shape)
+        x, y = axes["x"]["values"], axes["y"]["values"]
+    elif format == "npz":
+        with np.load(io.BytesIO(data)) as file:
+            values, x, y = file["bx_ut"], file["x_m"], file["y_m"]
+    else:
+        with netcdf_file(io.BytesIO(data), mmap=False) as file:
+            values, x, y = (np.array(file.variables[name][:]) for name in ("bx_ut", "x", "y"))
+            assert file.variables["bx_ut"].units == b"microtesla"
+    j, i = values.shape[1] // 2, values.shape[2] // 2
+    return float(x[i]), float(y[j]), float(values[0, j, i])
+
+
+@pytest.mark.parametrize("layer", ["norm", "bx", "sd"])
+def test_heat_maps_are_pictures(service: Any, active_map: str, layer: str) -> None:
+    answer = service.http.get(f"/v1/maps/{active_map}/heatmap.png", params={"layer": layer})
+    assert answer.status_code == 200, answer.text
+    assert answer.content.startswith(b"\x89PNG")
+
+
+def test_an_unknown_layer_names_the_layers_there_are(service: Any, active_map: str) -> None:
+    answer = service.http.get(f"/v1/maps/{active_map}/heatmap.png", params={"layer": "colour"})
+    assert answer.status_code == 422
+    assert "norm" in answer.text
+
+
+def test_the_static_view_is_one_self_contained_page(service: Any, active_map: str) -> None:
+    answer = service.http.get(f"/v1/maps/{active_map}/view.html")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/html")
+    assert b"<html" in answer.content[:2000].lower()
+
+
+def test_quality_lists_every_survey(service: Any, active_map: str) -> None:
+    quality = service.http.get(f"/v1/maps/{active_map}/quality").json()
+    assert set(quality["surveys"]) == set(service.http.get(f"/v1/maps/{active_map}").json()["survey_ids"])
+    assert quality["measured_area_m2"] > 50
+
+
+@pytest.mark.parametrize(("components", "columns"), [("level", ["horizontal", "vertical"]), ("norm", ["norm"])])
+def test_poorer_components_on_request(service: Any, mapped_floor: str, components: str, columns: list[str]) -> None:
+    body = {"components": components, "activate": False, "resolution_m": 0.5}
+    asked = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body)
+    assert asked.status_code == 202, asked.text
+    service.run_jobs()
+    made = service.http.get(f"/v1/maps/{asked.json()['map']['id']}").json()
+    assert (made["status"], made["active"], made["components"]) == ("ready", False, components)
+    assert made["resolution_m"] == 0.5
+    answer = service.http.post(f"/v1/maps/{made['id']}/field", json={"points_m": [[2, 2, 1.2]]}).json()
+    assert answer["components"] == columns
+    assert len(answer["mean_ut"][0]) == len(columns)
+
+
+def test_level_surveys_cannot_give_a_vector_map(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes]
+) -> None:
+    floor = new_floor()
+    answer = service.http.post(f"/v1/floors/{floor}/surveys", params={"frame": "level"}, content=walk_csv(1))
+    assert answer.status_code == 202
+    refused = service.http.post(f"/v1/floors/{floor}/maps", json={"components": "vector"})
+    assert refused.status_code == 422
+    assert refused.json()["type"].endswith("/incompatible-frames")
+    service.run_jobs()
+    active = service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
+    assert service.http.get(f"/v1/maps/{active}").json()["components"] == "level"
+
+
+def test_activation_moves_the_pointer_both_ways(service: Any, mapped_floor: str, active_map: str) -> None:
+    asked = service.http.post(f"/v1/floors/{mapped_floor}/maps", json={"activate": False, "engine": "hilbert"})
+    other = asked.json()["map"]["id"]
+    assert service.http.post(f"/v1/maps/{other}/activate").status_code == 409
+    service.run_jobs()
+    assert service.http.get(f"/v1/floors/{mapped_floor}").json()["active_map_id"] == active_map
+    assert service.http.post(f"/v1/maps/{other}/activate").json()["active"] is True
+    assert service.http.get(f"/v1/floors/{mapped_floor}").json()["active_map_id"] == other
+    assert service.http.post(f"/v1/maps/{active_map}/activate").json()["active"] is True
+
+
+def test_a_map_of_nothing_is_refused(service: Any, new_floor: Callable[..., str]) -> None:
+    floor = new_floor()
+    assert service.http.post(f"/v1/floors/{floor}/maps", json={}).status_code == 409
+    unknown = service.http.post(f"/v1/floors/{floor}/maps", json={"survey_ids": ["nope"]})
+    assert unknown.status_code == 422
+    assert "nope" in unknown.text
+
+
+def test_an_older_build_never_replaces_a_newer_one(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes]
+) -> None:
+    from app.services.build_map import claim_build, fit_build, publish_build
+
+    floor = new_floor(auto_build=False)
+    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
+    jobs = [service.http.post(f"/v1/floors/{floor}/maps", json={}).json()["job"]["id"] for _ in range(2)]
+    plans = []
+    for job in jobs:
+        with service.context.transaction() as session:
+            plans.append(claim_build(session, job))
+    results = [fit_build(plan, service.context.blobs, lambda fraction, message: None) for plan in plans]
+    for k in (1, 0):
+        with service.context.transaction() as session:
+            publish_build(session, jobs[k], plans[k], results[k])
+    assert service.http.get(f"/v1/floors/{floor}").json()["active_map_id"] == plans[1]["map_id"]
+    assert results[0]["grid_sha256"] == results[1]["grid_sha256"], "the same surveys give the same map"

@@ -1,0 +1,195 @@
+"""Uploads: what is taken, what is refused, and that a refusal stores nothing."""
+
+import gzip
+import threading
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import zstandard
+
+HEADER = "t_s,x_m,y_m,z_m,bx_ut,by_ut,bz_ut"
+Walk = Callable[..., bytes]
+NewFloor = Callable[..., str]
+
+
+def test_a_survey_is_received_mapped_and_judged(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor()
+    ids = []
+    for seed in (1, 2, 3):
+        answer = service.http.post(
+            f"/v1/floors/{floor}/surveys", params={"name": f"walk {seed}"}, content=walk_csv(seed, offset_m=0.2 * seed)
+        )
+        assert answer.status_code == 202
+        assert answer.json()["job"]["status"] == "accepted"
+        ids.append(answer.json()["survey"]["id"])
+    service.run_jobs()
+    job = service.http.get(f"/v1/jobs/{answer.json()['job']['id']}").json()
+    assert job["status"] == "successful", job
+    assert job["progress"] == 100
+    floor_map = service.http.get(f"/v1/maps/{job['map_id']}").json()
+    assert floor_map["active"]
+    assert sorted(floor_map["survey_ids"]) == sorted(ids)
+    assert max(floor_map["score"]["rmse_ut"]) < 1.0, floor_map["score"]
+    verdict = service.http.get(f"/v1/surveys/{ids[0]}/consistency").json()
+    assert verdict["status"] == "consistent", verdict
+    assert [c["component"] for c in verdict["components"]] == ["bx", "by", "bz"]
+    report = service.http.get(f"/v1/surveys/{ids[0]}/report").json()
+    assert report
+    samples = service.http.get(f"/v1/surveys/{ids[0]}/samples", params={"limit": 10}).json()
+    assert samples["columns"] == ["t_s", "x_m", "y_m", "z_m", "bx_ut", "by_ut", "bz_ut"]
+    assert 5 <= len(samples["rows"]) <= 10
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "zstd"])
+def test_compressed_bodies_are_the_same_survey(
+    service: Any, new_floor: NewFloor, walk_csv: Walk, encoding: str
+) -> None:
+    floor, data = new_floor(), walk_csv(4)
+    packed = gzip.compress(data) if encoding == "gzip" else zstandard.compress(data)
+    first = service.http.post(f"/v1/floors/{floor}/surveys", content=packed, headers={"Content-Encoding": encoding})
+    again = service.http.post(f"/v1/floors/{floor}/surveys", content=data)
+    assert (first.status_code, again.status_code) == (202, 200)
+    assert first.json()["survey"] == again.json()["survey"]
+
+
+def test_concurrent_uploads_of_the_same_bytes_make_one_survey(
+    service: Any, new_floor: NewFloor, walk_csv: Walk
+) -> None:
+    floor, data, answers = new_floor(), walk_csv(5), []
+
+    def upload() -> None:
+        answers.append(service.http.post(f"/v1/floors/{floor}/surveys", content=data))
+
+    threads = [threading.Thread(target=upload) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(a.status_code for a in answers) == [200] * 5 + [202], [a.text for a in answers]
+    assert len({a.json()["survey"]["id"] for a in answers}) == 1
+    assert len(service.http.get(f"/v1/floors/{floor}/surveys").json()["items"]) == 1
+
+
+def _rows(*rows: str, header: str = HEADER) -> bytes:
+    return ("\n".join([header, *rows]) + "\n").encode()
+
+
+GOOD = ["0.0,0,0,1.2,20,1,-42", "0.1,0.1,0,1.2,20,1,-42", "0.2,0.2,0,1.2,20,1,-42"]
+BAD_FILES = {
+    "empty": (b"", ""),
+    "header only": (_rows(), ""),
+    "one sample": (_rows(GOOD[0]), ""),
+    "missing column": (_rows("0,0,0,1.2,20,1", header="t_s,x_m,y_m,z_m,bx_ut,by_ut"), "bz_ut"),
+    "short row": (_rows(*GOOD, "0.3,0,0"), "5"),
+    "not a number": (_rows(*GOOD, "0.3,0,0,1.2,20,one,-42"), "by_ut"),
+    "nan": (_rows(*GOOD, "0.3,0,0,1.2,nan,1,-42"), "bx_ut"),
+    "infinity": (_rows(*GOOD, "0.3,inf,0,1.2,20,1,-42"), "x_m"),
+    "time goes backwards": (_rows(*GOOD, "0.05,0,0,1.2,20,1,-42"), "t_s"),
+    "nanotesla": (_rows(*[f"0.{i},0,0,1.2,20000,1000,-42000" for i in range(5)]), "nanotesla"),
+    "gauss": (_rows(*[f"0.{i},0,0,1.2,0.2,0.01,-0.42" for i in range(5)]), "gauss"),
+    "zero quaternion": (_rows(*[row + ",0,0,0,0" for row in GOOD], header=HEADER + ",qw,qx,qy,qz"), "q"),
+    "not text": (b"\xff\xfe\x00\x01" * 50, ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_file_is_refused_with_where_and_why_and_nothing_is_stored(
+    service: Any, mapped_floor: str, name: str
+) -> None:
+    data, said = BAD_FILES[name]
+    before = service.row_counts(), service.blob_count()
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/surveys", content=data)
+    assert answer.status_code == 422, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem["type"].endswith("/unreadable-survey")
+    assert problem["errors"], problem
+    assert said in answer.text
+    assert (service.row_counts(), service.blob_count()) == before
+
+
+@pytest.mark.parametrize("format", ["parquet", "ndjson", "indoor-location-2020"])
+@pytest.mark.parametrize("data", [b"", b"\x00\x01garbage", b"PAR1" + b"\x00" * 50 + b"PAR1", b'{"t_s": 1'])
+def test_corrupt_files_of_other_formats_are_refused(service: Any, mapped_floor: str, format: str, data: bytes) -> None:
+    before = service.row_counts(), service.blob_count()
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/surveys", params={"format": format}, content=data)
+    assert answer.status_code == 422, answer.text
+    assert (service.row_counts(), service.blob_count()) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "headers", "status"),
+    [
+        (gzip.compress(b"0" * 2**22), {"Content-Encoding": "gzip"}, 413),
+        (gzip.compress(b"0" * 2**21) + gzip.compress(b"0" * 2**21), {"Content-Encoding": "gzip"}, 413),
+        (zstandard.compress(b"0" * 2**22), {"Content-Encoding": "zstd"}, 413),
+        (b"0" * (2**21 + 1), {}, 413),
+        (gzip.compress(b"hello")[:-6], {"Content-Encoding": "gzip"}, 422),
+        (b"not gzip", {"Content-Encoding": "gzip"}, 422),
+        (zstandard.compress(b"hello" * 100)[:-3], {"Content-Encoding": "zstd"}, 422),
+        (zlib.compress(b"hello"), {"Content-Encoding": "br"}, 422),
+    ],
+)
+def test_bombs_and_damaged_streams_are_refused_and_nothing_is_stored(
+    service: Any, mapped_floor: str, content: bytes, headers: dict[str, str], status: int
+) -> None:
+    before = service.row_counts(), service.blob_count()
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/surveys", content=content, headers=headers)
+    assert answer.status_code == status, answer.text
+    assert (service.row_counts(), service.blob_count()) == before
+
+
+def test_an_upload_needs_a_floor_of_ones_own_and_the_scope(
+    service: Any, mapped_floor: str, walk_csv: Walk, stranger: dict[str, str], key_with: Callable[..., dict[str, str]]
+) -> None:
+    reader, before = key_with("map:read"), None
+    before = service.row_counts(), service.blob_count()
+    path = f"/v1/floors/{mapped_floor}/surveys"
+    assert service.http.post(path, content=walk_csv(9), headers=stranger).status_code == 404
+    assert service.http.post(path, content=walk_csv(9), headers=reader).status_code == 403
+    assert service.http.post(path, content=walk_csv(9), headers={"Authorization": "Bearer isd_no"}).status_code == 401
+    assert service.http.post("/v1/floors/none/surveys", content=walk_csv(9)).status_code == 404
+    assert (service.row_counts(), service.blob_count()) == before
+
+
+def test_leaving_a_survey_out_and_deleting_it_set_off_rebuilds(
+    service: Any, new_floor: NewFloor, walk_csv: Walk
+) -> None:
+    floor = new_floor()
+    first, second = (
+        service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(seed)).json()["survey"]["id"]
+        for seed in (1, 2)
+    )
+    service.run_jobs()
+    assert service.http.patch(f"/v1/surveys/{second}", json={"included": False}).json()["included"] is False
+    service.run_jobs()
+    active = service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
+    alone = service.http.get(f"/v1/maps/{active}").json()
+    assert alone["survey_ids"] == [first]
+    assert alone["score"] is None
+    assert alone["score_reason"]
+    assert service.http.delete(f"/v1/surveys/{second}").status_code == 204
+    assert service.http.get(f"/v1/surveys/{second}").status_code == 404
+    service.run_jobs()
+
+
+def test_a_floor_that_does_not_build_by_itself_has_no_job(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor(auto_build=False)
+    answer = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
+    assert answer.status_code == 202
+    assert answer.json()["job"] is None
+    asked = service.http.post(f"/v1/floors/{floor}/maps", json={})
+    assert asked.status_code == 202
+    service.run_jobs()
+    assert service.http.get(f"/v1/maps/{asked.json()['map']['id']}").json()["status"] == "ready"
+
+
+def test_the_same_idempotency_key_gives_the_same_answer(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor, headers = new_floor(), {"Idempotency-Key": "walk-17"}
+    first = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1), headers=headers)
+    again = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1), headers=headers)
+    other = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(2), headers=headers)
+    assert (first.status_code, again.status_code, other.status_code) == (202, 202, 409)
+    assert first.json() == again.json()

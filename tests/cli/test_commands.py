@@ -1,0 +1,109 @@
+"""The commands as a user types them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from app.cli import main
+from app.cli.doctor import examine
+from app.settings import Settings
+
+runner = CliRunner()
+
+
+@pytest.fixture
+def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in list(os.environ):
+        if name.startswith("ISODYN_"):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("ISODYN_DATA_DIR", str(tmp_path / "var"))
+    monkeypatch.setenv("COLUMNS", "200")
+    return tmp_path / "var"
+
+
+def test_every_command_explains_itself() -> None:
+    for command in ("serve", "worker", "demo", "ingest", "locate", "export", "evaluate", "keys", "doctor", "openapi"):
+        result = runner.invoke(main, [command, "--help"])
+        assert result.exit_code == 0, result.output
+
+
+def test_keys_are_made_shown_once_listed_and_revoked(data_dir: Path) -> None:
+    made = runner.invoke(main, ["keys", "create", "robot", "--scope", "locate", "--scope", "map:read"])
+    assert made.exit_code == 0, made.output
+    key = made.output.strip()
+    assert key.startswith("isd_")
+    listed = runner.invoke(main, ["keys", "list"])
+    assert "robot" in listed.output
+    assert "locate, map:read" in listed.output
+    assert key not in listed.output
+    assert key.encode() not in (data_dir / "isodyn.db").read_bytes()
+    key_id = next(word for word in listed.output.replace("│", " ").split() if word.count("-") == 4 and len(word) == 36)
+    assert runner.invoke(main, ["keys", "revoke", key_id]).exit_code == 0
+    assert runner.invoke(main, ["keys", "revoke", "nobody"]).exit_code == 1
+
+
+def test_an_unknown_scope_is_refused_with_the_known_ones(data_dir: Path) -> None:
+    result = runner.invoke(main, ["keys", "create", "x", "--scope", "everything"])
+    assert result.exit_code == 1
+    assert "map:read" in result.output
+
+
+def test_the_doctor_finds_nothing_wrong_with_a_fresh_start(data_dir: Path) -> None:
+    assert runner.invoke(main, ["doctor"]).exit_code == 0
+    runner.invoke(main, ["keys", "create", "x", "--scope", "locate"])
+    result = runner.invoke(main, ["doctor"])
+    assert result.exit_code == 0, result.output
+    assert "schema" in result.output
+
+
+def test_the_doctor_says_what_is_wrong_and_what_to_do(data_dir: Path) -> None:
+    data_dir.mkdir()
+    (data_dir / "isodyn.db").write_bytes(b"this is not a database" * 100)
+    result = runner.invoke(main, ["doctor"])
+    assert result.exit_code == 1
+    assert "wrong" in result.output
+    broken = [finding for finding in examine(Settings()) if finding.ok is False]
+    assert [finding.what for finding in broken] == ["database"]
+
+
+def test_the_doctor_notices_an_unreachable_database(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ISODYN_DATABASE_URL", "postgresql+psycopg://nobody@127.0.0.1:1/none?connect_timeout=2")
+    findings = {finding.what: finding for finding in examine(Settings())}
+    assert findings["database"].ok is False
+
+
+def test_openapi_is_written(data_dir: Path, tmp_path: Path) -> None:
+    result = runner.invoke(main, ["openapi", "--output", str(tmp_path / "openapi.json")])
+    assert result.exit_code == 0, result.output
+    document = json.loads((tmp_path / "openapi.json").read_text())
+    assert "/v1/buildings/{building_id}/locate" in document["paths"]
+    assert document["components"]["schemas"]["LocateBody"]["examples"]
+
+
+def test_an_unreachable_server_is_one_sentence(data_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "walk.csv").write_text("t_s\n")
+    arguments = ["ingest", "floor", str(tmp_path / "walk.csv"), "--key", "isd_x", "--url", "http://127.0.0.1:1"]
+    result = runner.invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "isodyn serve" in result.output
+
+
+def test_the_web_process_starts_without_scikit_learn_viser_or_magpylib() -> None:
+    """Start-up stays quick: what few requests need is loaded when one comes."""
+    code = (
+        "import sys, app.main; print([m for m in ('sklearn', 'viser', 'magpylib', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_setting_is_documented() -> None:
+    readme = Path(__file__).parents[2] / "docs" / "settings.md"
+    text = readme.read_text()
+    for name in Settings.model_fields:
+        assert f"ISODYN_{name.upper()}" in text, name
