@@ -36,7 +36,12 @@ class CosineBasis:
     def frequencies_squared(self) -> Array:
         """(m,) eigenvalues of minus the Laplacian, (rad/m)^2."""
         axis = np.square(np.pi / self.side_m * np.arange(self.functions_per_axis))
-        return (axis[:, None] + axis[None, :]).ravel()
+        return np.asarray((axis[:, None] + axis[None, :]).ravel())
+
+    @property
+    def cutoff_rad_per_m(self) -> float:
+        """Radius of the disc of as much area as the square of frequencies the functions reach."""
+        return float(2.0 / np.sqrt(np.pi) * np.pi / self.side_m * (self.functions_per_axis - 0.5))
 
     def along(self, axis: int, coordinate_m: Array) -> Array:
         """(n, functions_per_axis) values of the functions of one axis (0: x, 1: y)."""

@@ -10,7 +10,14 @@ import numpy as np
 from app.field.spec import Kernel
 from app.geometry import Array
 
-__all__ = ["MATERN_SMOOTHNESS", "covariance", "covariance_slope", "log_spectral_slope", "spectral_density"]
+__all__ = [
+    "MATERN_SMOOTHNESS",
+    "covariance",
+    "covariance_slope",
+    "log_spectral_slope",
+    "spectral_density",
+    "variance_beyond",
+]
 
 MATERN_SMOOTHNESS: dict[Kernel, float] = {"matern32": 1.5, "matern52": 2.5}
 
@@ -51,3 +58,12 @@ def log_spectral_slope(kernel: Kernel, frequency_squared: Array, length_m: float
     nu = MATERN_SMOOTHNESS[kernel]
     z = frequency_squared * length_m**2 / (2.0 * nu)
     return 2.0 - 2.0 * (nu + 1.0) * z / (1.0 + z)
+
+
+def variance_beyond(kernel: Kernel, cutoff_rad_per_m: float, length_m: float) -> float:
+    """Share of a unit variance at frequencies above the cutoff."""
+    z = 0.5 * (cutoff_rad_per_m * length_m) ** 2
+    if kernel == "squared_exponential":
+        return float(np.exp(-z))
+    nu = MATERN_SMOOTHNESS[kernel]
+    return float((1.0 + z / nu) ** -nu)

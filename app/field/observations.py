@@ -28,7 +28,8 @@ class Walk:
     field_uT        (n, c) mean features of each stretch
     path_m          (n,) distance walked
     scatter_uT2     (c,) mean variance of single samples about the mean of their stretch
-    sample_count    samples the walk had
+    sample_position_m, sample_field_uT   (N, 3), (N, c) the samples themselves
+    stretch_of_sample                    (N,) the observation each sample went into
     """
 
     survey_id: str
@@ -36,7 +37,9 @@ class Walk:
     field_uT: Array
     path_m: Array
     scatter_uT2: Array
-    sample_count: int
+    sample_position_m: Array
+    sample_field_uT: Array
+    stretch_of_sample: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -66,10 +69,11 @@ def _average(survey_id: str, samples: Samples, components: Components, stretch_m
     position_m = np.add.reduceat(position, starts, axis=0) / counts[:, None]
     mean = np.add.reduceat(field_uT, starts, axis=0) / counts[:, None]
     deviation = field_uT - np.repeat(mean, counts, axis=0)
-    scatter = np.sum(np.square(deviation), axis=0) / max(len(samples) - len(starts), 1)
+    scatter = np.mean(np.square(deviation), axis=0)
     steps = np.linalg.norm(np.diff(position_m[:, :2], axis=0), axis=1)
     path_m = np.concatenate([[0.0], np.cumsum(steps)])
-    return Walk(survey_id, position_m, mean, path_m, scatter, len(samples))
+    stretch_of_sample = np.repeat(np.arange(len(starts)), counts)
+    return Walk(survey_id, position_m, mean, path_m, scatter, position, field_uT, stretch_of_sample)
 
 
 def _stretch_starts(position_m: Array, stretch_m: float) -> NDArray[np.int64]:

@@ -8,13 +8,20 @@ from app.field.grid import FieldGrid
 from app.field.samples import Components
 
 __all__ = [
-    "ComponentConsistency", "ConsistencyReport", "FittedMap", "Engine", "Kernel", "MapSpec", "Progress", "Score",
+    "ComponentConsistency",
+    "ConsistencyReport",
+    "FittedMap",
+    "Engine",
+    "Kernel",
+    "MapSpec",
+    "Progress",
+    "Score",
     "SegmentConsistency",
 ]
 
 Engine = Literal["hilbert", "exact"]
 Kernel = Literal["squared_exponential", "matern32", "matern52"]
-Progress = Callable[[float, str], None]   # (fraction 0..1, message); may raise JobCancelled
+Progress = Callable[[float, str], None]  # (fraction 0..1, message); may raise JobCancelled
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +53,11 @@ class ComponentConsistency:
     """One component of Kuevor B14 for one survey against the others' map."""
 
     component: str
-    coverage_2sigma: float          # fraction of errors within two predictive sd
-    seed_2sigma_96: bool            # the seed's rule: coverage >= 0.96 (Kuevor, L904)
+    coverage_2sigma: float  # fraction of errors within two predictive sd
+    seed_2sigma_96: bool  # the seed's rule: coverage >= 0.96 (Kuevor, L904)
     rmse_ut: float
-    mean_sd_ut: float               # sharpness
-    p_value: float                  # of a coverage this low if calibrated (0.9545), accounting for autocorrelation
+    mean_sd_ut: float  # sharpness
+    p_value: float  # of a coverage this low if calibrated (0.9545), accounting for autocorrelation
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,5 +93,5 @@ class FittedMap:
     grid: FieldGrid
     hyperparameters: dict[str, object]
     score: Score | None
-    score_reason: str | None        # why there is no score
-    consistency: dict[str, ConsistencyReport] = field(default_factory=dict)   # by survey id
+    score_reason: str | None  # why there is no score
+    consistency: dict[str, ConsistencyReport] = field(default_factory=dict)  # by survey id

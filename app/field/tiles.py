@@ -17,10 +17,10 @@ from app.geometry import Array
 __all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "Lattice", "Tile"]
 
 PITCHES_M = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0)
-PITCH_IN_LENGTHS = 4.0
+PITCH_IN_LENGTHS = 3.0
 MARGIN = 0.3
 OVERLAP = 0.1
-FUNCTIONS_PER_AXIS = 18
+FUNCTIONS_PER_AXIS = 20
 
 
 class Tile(NamedTuple):
@@ -41,7 +41,7 @@ class Lattice:
 
     @classmethod
     def for_length(cls, length_m: float) -> "Lattice":
-        """The finest lattice whose pitch is at least four length scales: the box then spans six to nine."""
+        """The finest lattice whose pitch is at least three length scales: the box then spans five to seven."""
         pitch = next((p for p in PITCHES_M if p >= PITCH_IN_LENGTHS * length_m), PITCHES_M[-1])
         return cls(pitch)
 

@@ -1,0 +1,70 @@
+"""Reduced-rank Gaussian process on one tile: posterior weights, and the field they stand for.
+
+Weights `w ~ N(0, signal^2 S)`; the posterior covariance in units of the signal variance is the same for every
+component, since length and noise ratios are shared: one factor, one variance for all.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtri
+
+from app.field.basis import CosineBasis, VarianceSeries
+from app.field.hyperparameters import Hyperparameters
+from app.field.kernels import spectral_density
+from app.field.statistics import Evidence
+from app.geometry import Array
+
+__all__ = ["LatticeField", "TilePosterior", "posterior"]
+
+
+class LatticeField(NamedTuple):
+    """On ny rows and nx columns: mean (c, ny, nx) about the ambient, slopes with x and y alike, variance (ny, nx)."""
+
+    mean_uT: Array
+    slope_x_uT_per_m: Array
+    slope_y_uT_per_m: Array
+    variance_ratio: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TilePosterior:
+    """weights_uT (m, c); variance: of the functions' sum, over the signal variance of each component.
+
+    detail_ratio is added to it: the variance of what is too fine for the functions. Never above the prior's.
+    """
+
+    basis: CosineBasis
+    weights_uT: Array
+    variance: VarianceSeries
+    detail_ratio: float
+
+    def at(self, points_m: Array) -> tuple[Array, Array]:
+        """Mean about the ambient (n, c) in uT and variance ratio (n,) at points (n, 2)."""
+        return self.basis.at(points_m) @ self.weights_uT, np.minimum(
+            self.variance.at(points_m) + self.detail_ratio, 1.0
+        )
+
+    def on_lattice(self, x_m: Array, y_m: Array) -> LatticeField:
+        """The field at the crossings of columns `x_m` and rows `y_m`, axis by axis."""
+        k = self.basis.functions_per_axis
+        by_axis = self.weights_uT.T.reshape(-1, k, k).transpose(0, 2, 1)
+        x, y = self.basis.along(0, x_m).T, self.basis.along(1, y_m)
+        dx, dy = self.basis.slope_along(0, x_m).T, self.basis.slope_along(1, y_m)
+        rows, row_slopes = y @ by_axis, dy @ by_axis
+        variance = np.minimum(self.variance.on_lattice(x_m, y_m) + self.detail_ratio, 1.0)
+        return LatticeField(rows @ x, rows @ dx, row_slopes @ x, variance)
+
+
+def posterior(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> TilePosterior:
+    """The posterior of one tile given the sum of its surveys' evidence."""
+    root = np.sqrt(spectral_density(hyper.kernel, basis.frequencies_squared, hyper.length_m))
+    precision = evidence.gram * np.outer(root, root)
+    precision[np.diag_indices_from(precision)] += 1.0
+    factor, info = dpotrf(precision, lower=1, clean=1)
+    assert info == 0, info
+    inverse, _ = dtrtri(factor, lower=1)
+    scaled = inverse * root
+    weights_uT = scaled.T @ (scaled @ evidence.target)
+    return TilePosterior(basis, weights_uT, VarianceSeries.of(basis, scaled.T @ scaled), hyper.detail_ratio(basis))

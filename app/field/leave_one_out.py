@@ -1,0 +1,120 @@
+"""The honest score of a map: every survey predicted from all the others.
+
+A map is a sum of its surveys' evidence, so the map of the others is a subtraction, tile by tile; hyper-parameters
+and ambient field are the whole map's.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.field.hilbert import posterior
+from app.field.hyperparameters import Hyperparameters
+from app.field.observations import Walk
+from app.field.spec import Score
+from app.field.statistics import Evidence
+from app.field.tiles import Lattice, Tile
+from app.geometry import Array
+
+__all__ = ["HeldOut", "HeldOutPrediction", "error_correlation_m", "score"]
+
+LAG_M = 0.25
+MAX_LAG_M = 20.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """A survey against the map of the others.
+
+    error_uT, sd_uT (N, c): measured minus predicted, and the predictive sd (noise included), of every sample
+    judged (N,): samples near enough to another survey to be judged
+    path_m (N,): distance walked
+    """
+
+    error_uT: Array
+    sd_uT: Array
+    judged: NDArray[np.bool_]
+    path_m: Array
+
+    @property
+    def standardised(self) -> Array:
+        """(J, c) errors of the judged samples in predictive sds."""
+        return self.error_uT[self.judged] / self.sd_uT[self.judged]
+
+    @property
+    def nlpd(self) -> float:
+        """Mean negative log predictive density of the judged samples, per sample and component."""
+        log_sd = np.log(self.sd_uT[self.judged])
+        return float(np.mean(0.5 * np.log(2 * np.pi) + log_sd + 0.5 * np.square(self.standardised)))
+
+
+class HeldOutPrediction:
+    """Predictions at every walk's samples from the other walks, gathered tile by tile."""
+
+    def __init__(self, lattice: Lattice, walks: Sequence[Walk], hyper: Hyperparameters) -> None:
+        self._lattice, self._hyper = lattice, hyper
+        self._walks = {walk.survey_id: walk for walk in walks}
+        self._answering = {walk.survey_id: lattice.answering(walk.sample_position_m[:, :2]) for walk in walks}
+        self.mean_uT = {walk.survey_id: np.zeros(walk.sample_field_uT.shape) for walk in walks}
+        self.variance_ratio = {walk.survey_id: np.ones(len(walk.sample_field_uT)) for walk in walks}
+
+    def add(self, tile: Tile, evidence: Mapping[str, Evidence], total: Evidence) -> None:
+        """Predict the walks that cross this tile, each from the evidence of the others."""
+        basis = self._lattice.basis(tile)
+        for survey_id, own in evidence.items():
+            inside = self._answering[survey_id].get(tile)
+            if inside is None or len(evidence) == 1:
+                continue
+            points_m = self._walks[survey_id].sample_position_m[inside, :2]
+            mean_uT, variance_ratio = posterior(basis, total - own, self._hyper).at(points_m)
+            weight = self._lattice.weight(0, tile, points_m[:, 0]) * self._lattice.weight(1, tile, points_m[:, 1])
+            self.mean_uT[survey_id][inside] += weight[:, None] * mean_uT
+            self.variance_ratio[survey_id][inside] += weight * (variance_ratio - 1.0)
+
+
+def score(held_out: Mapping[str, HeldOut]) -> Score | None:
+    """Over all judged samples of all surveys; None when no survey comes near another."""
+    judged = [h for h in held_out.values() if h.judged.any()]
+    if not judged:
+        return None
+    error_uT = np.concatenate([h.error_uT[h.judged] for h in judged])
+    standardised = np.concatenate([h.standardised for h in judged])
+    counts = np.array([np.count_nonzero(h.judged) for h in judged])
+    return Score(
+        rmse_ut=tuple(np.sqrt(np.mean(np.square(error_uT), axis=0)).tolist()),
+        coverage_2sigma=tuple(np.mean(np.abs(standardised) <= 2.0, axis=0).tolist()),
+        nlpd=float(counts @ [h.nlpd for h in judged] / counts.sum()),
+        held_out_samples=len(error_uT),
+    )
+
+
+def error_correlation_m(held_out: Mapping[str, HeldOut]) -> float:
+    """Distance walked over which errors against the map stay correlated: the integral of their autocorrelation.
+
+    The median over surveys, so that one bad survey does not set it; 0 when no survey can be judged.
+    """
+    lengths = [length for h in held_out.values() if (length := _integral_length(h)) is not None]
+    return float(np.median(lengths)) if lengths else 0.0
+
+
+def _integral_length(held_out: HeldOut) -> float | None:
+    """Integral of one survey's autocorrelation up to its first zero; None when too little of it is judged."""
+    path_m = held_out.path_m[held_out.judged]
+    cell = np.floor(path_m / LAG_M).astype(np.int64)
+    cells, first = np.unique(cell, return_index=True)
+    if len(cells) < 8:
+        return None
+    z = np.add.reduceat(np.clip(held_out.standardised, -5.0, 5.0), first, axis=0)
+    z /= np.diff(np.append(first, len(cell)))[:, None]
+    padded = np.full((cells[-1] - cells[0] + 1, z.shape[1]), np.nan)
+    padded[cells - cells[0]] = z
+    power = np.nanmean(np.square(padded))
+    total = 0.5
+    for lag in range(1, min(int(MAX_LAG_M / LAG_M), len(padded) - 1)):
+        products = padded[lag:] * padded[:-lag]
+        if np.isnan(products).all() or (rho := float(np.nanmean(products) / power)) <= 0.0:
+            break
+        total += rho
+    return total * LAG_M

@@ -1,0 +1,159 @@
+"""Hyper-parameters by maximum marginal likelihood, from sufficient statistics alone: no pass over samples.
+
+The signal variance of each component is concentrated out (`sigma^2 = y^T C^-1 y / n`), which leaves three parameters
+shared by all components: log length, log white ratio, log bias ratio. One evaluation costs O(m^3) per tile. Detail of
+the field finer than the functions can only be learned as white error, which errs on the side of a larger one.
+Rasmussen & Williams 2006, 5.4.1; statistics as Solin & Sarkka 2020, 3.3.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg.blas import dtrmm
+from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.optimize import minimize
+
+from app.field.basis import CosineBasis
+from app.field.hyperparameters import Hyperparameters
+from app.field.kernels import log_spectral_slope, spectral_density
+from app.field.spec import Kernel
+from app.field.statistics import SurveyStatistics
+from app.field.walk_noise import WalkNoise
+from app.geometry import Array
+
+__all__ = ["Likelihood", "TileStatistics", "learn", "negative_log_likelihood"]
+
+SCALE_FLOOR_UT2 = 1e-6
+LENGTH_BOUNDS_M = (0.3, 40.0)
+RATIO_BOUNDS_LOG = np.log([(1e-6, 1e2), (1e-8, 1e1)])
+MAX_ITERATIONS = 40
+START_LOG = np.log([3.0, 1e-2, 1e-3])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileStatistics:
+    """The surveys of one tile, and the functions they were projected on."""
+
+    basis: CosineBasis
+    surveys: Mapping[str, SurveyStatistics]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likelihood:
+    """value: negative log marginal likelihood; gradient (3,) over log length, log white ratio, log bias ratio."""
+
+    value: float
+    gradient: Array
+    signal_variance_uT2: Array
+
+
+@dataclass(slots=True)
+class _Terms:
+    """Of one tile or a sum of tiles: energy (c,) `y^T C^-1 y`, log_det of C, and their derivatives (3, c) and (3,)."""
+
+    energy: Array
+    log_det: float
+    energy_slope: Array
+    log_det_slope: Array
+    count: int
+
+
+def negative_log_likelihood(tiles: Sequence[TileStatistics], kernel: Kernel, log_parameters: Array) -> Likelihood:
+    """Concentrated over the signal variances, summed over tiles and components."""
+    length_m, white_ratio, bias_ratio = np.exp(log_parameters)
+    terms = [_tile_terms(tile, kernel, length_m, white_ratio, bias_ratio) for tile in tiles]
+    n = sum(term.count for term in terms)
+    energy = np.sum([term.energy for term in terms], axis=0) + n * SCALE_FLOOR_UT2
+    components = len(energy)
+    log_det = sum(term.log_det for term in terms)
+    value = 0.5 * n * np.sum(np.log(energy / n) + 1.0 + np.log(2 * np.pi)) + 0.5 * components * log_det
+    energy_slope = np.sum([term.energy_slope for term in terms], axis=0)
+    log_det_slope = np.sum([term.log_det_slope for term in terms], axis=0)
+    gradient = 0.5 * n * np.sum(energy_slope / energy, axis=1) + 0.5 * components * log_det_slope
+    return Likelihood(float(value), gradient, energy / n)
+
+
+def learn(
+    tiles: Sequence[TileStatistics],
+    kernel: Kernel,
+    walk_noise: WalkNoise,
+    start_log: Array = START_LOG,
+    length_bounds_m: tuple[float, float] = LENGTH_BOUNDS_M,
+    pin_bias: bool = False,
+) -> tuple[Hyperparameters, Array, float]:
+    """The most likely hyper-parameters, their logarithms (to start from next time), and the value reached.
+
+    `pin_bias` keeps the offset at its lower bound: a single survey's offset is the ambient field's.
+    """
+    bounds = np.vstack([np.log(length_bounds_m), RATIO_BOUNDS_LOG])
+    if pin_bias:
+        bounds[2, 1] = bounds[2, 0]
+
+    def objective(log_parameters: Array) -> tuple[float, Array]:
+        likelihood = negative_log_likelihood(tiles, kernel, log_parameters)
+        return likelihood.value / count, likelihood.gradient / count
+
+    count = sum(survey.count for tile in tiles for survey in tile.surveys.values())
+    start = np.clip(start_log, bounds[:, 0], bounds[:, 1])
+    best = minimize(
+        objective,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=list(map(tuple, bounds.tolist())),
+        options={"maxiter": MAX_ITERATIONS, "ftol": 1e-7},
+    )
+    likelihood = negative_log_likelihood(tiles, kernel, best.x)
+    length_m, white_ratio, bias_ratio = (float(v) for v in np.exp(best.x))
+    scale = np.sqrt(likelihood.signal_variance_uT2)
+    hyper = Hyperparameters(kernel, length_m, scale, white_ratio, bias_ratio)
+    walk_ratio = walk_noise.variance_ratio * white_ratio
+    return replace(hyper, walk_ratio=walk_ratio, walk_length_m=walk_noise.length_m), best.x, likelihood.value
+
+
+def _tile_terms(tile: TileStatistics, kernel: Kernel, length_m: float, white: float, bias: float) -> _Terms:
+    """Energy and log determinant of one tile, with S^(1/2)-scaled weights so that every matrix is I plus something."""
+    surveys = list(tile.surveys.values())
+    root = np.sqrt(spectral_density(kernel, tile.basis.frequencies_squared, length_m))
+    ones = np.array([s.ones for s in surveys])
+    shrink = bias / (white + bias * ones)
+    offsets = root[:, None] * np.stack([s.offset for s in surveys], axis=1)
+    offset_targets = np.stack([s.ones_target for s in surveys])
+    gram = np.sum([s.gram for s in surveys], axis=0) * np.outer(root, root)
+    gram -= (offsets * shrink) @ offsets.T
+    target = root[:, None] * np.sum([s.target for s in surveys], axis=0) - offsets @ (shrink[:, None] * offset_targets)
+    energy = np.sum([s.energy for s in surveys], axis=0) - shrink @ np.square(offset_targets)
+
+    precision = gram / white
+    precision[np.diag_indices_from(precision)] += 1.0
+    factor, info = dpotrf(precision, lower=1, clean=1)
+    assert info == 0, info
+    inverse, _ = dtrtri(factor, lower=1)
+    z = inverse.T @ (inverse @ target) / white
+    misfit = energy - 2.0 * np.sum(z * target, axis=0) + np.sum(z * (gram @ z), axis=0)
+
+    count = sum(s.count for s in surveys)
+    variance = np.sum(np.square(inverse), axis=0)
+    own = bias * ones / (white + bias * ones)
+    log_det = 2.0 * np.sum(np.log(np.diagonal(factor))) + count * np.log(white) - np.sum(np.log1p(-own))
+    log_det += sum(s.log_det_shape for s in surveys)
+
+    slope = log_spectral_slope(kernel, tile.basis.frequencies_squared, length_m)
+    shrink_slope = shrink * white / (white + bias * ones)
+    energy_by_shrink = -np.square(offset_targets - offsets.T @ z) / white
+    log_det_by_shrink = -np.sum(np.square(dtrmm(1.0, inverse, offsets, lower=1)), axis=0) / white
+    energy_by_bias, log_det_by_bias = shrink_slope @ energy_by_shrink, shrink_slope @ log_det_by_shrink
+    return _Terms(
+        energy=(energy - np.sum(z * target, axis=0)) / white,
+        log_det=float(log_det),
+        energy_slope=np.stack([-slope @ np.square(z), -misfit / white - energy_by_bias, energy_by_bias]),
+        log_det_slope=np.array(
+            [
+                slope @ (1.0 - variance),
+                count - (len(root) - np.sum(variance)) - np.sum(own) - log_det_by_bias,
+                np.sum(own) + log_det_by_bias,
+            ]
+        ),
+        count=count,
+    )
