@@ -16,7 +16,7 @@ from app.field.observations import Walk, observe
 from app.field.raster import BlendedField, GridFrame
 from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import FittedMap, MapSpec, Progress
-from app.field.statistics import marginalise, statistics_by_tile
+from app.field.statistics import TiledWalks, marginalise
 from app.geometry import Array
 
 __all__ = ["fit_map"]
@@ -48,12 +48,13 @@ def _fit_hilbert(walks: Sequence[Walk], spec: MapSpec, height_m: float | None, p
     frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, height_m)
     blended = BlendedField(lattice, frame, len(ambient_uT))
     predicted = HeldOutPrediction(lattice, walks, hyper)
-    tiles = sorted({tile for walk in walks for tile in lattice.fitting(walk.position_m[:, :2])})
+    tiled = TiledWalks(lattice, walks, ambient_uT)
+    tiles = list(tiled.counts())
     for index, tile in enumerate(tiles):
         progress(0.3 + 0.65 * index / len(tiles), f"fitting tile {index + 1} of {len(tiles)}")
         basis = lattice.basis(tile)
         white_ratio = hyper.white_ratio_in(basis)
-        surveys = statistics_by_tile(lattice, walks, ambient_uT, hyper.walk_noise_in(basis), [tile])[tile]
+        surveys = tiled.statistics(tile, hyper.walk_noise_in(basis))
         evidence = {name: marginalise(s, white_ratio, hyper.bias_ratio) for name, s in surveys.items()}
         total = sum(list(evidence.values())[1:], start=next(iter(evidence.values())))
         blended.add(tile, posterior(basis, total, hyper))
@@ -118,12 +119,13 @@ def _held_out(
     held_out: dict[str, HeldOut] = {}
     for walk in walks:
         name = walk.survey_id
-        variance_uT2 = np.multiply.outer(predicted.variance_ratio[name], np.square(hyper.signal_sd_uT))
+        stretch = walk.stretch_of_sample
+        variance_uT2 = np.multiply.outer(predicted.variance_ratio[name][stretch], np.square(hyper.signal_sd_uT))
         held_out[name] = HeldOut(
-            error_uT=walk.sample_field_uT - ambient_uT - predicted.mean_uT[name],
+            error_uT=walk.sample_field_uT - ambient_uT - predicted.mean_uT[name][stretch],
             sd_uT=np.sqrt(variance_uT2 + np.square(noise_sd_uT)),
             judged=near[name],
-            path_m=walk.path_m[walk.stretch_of_sample],
+            path_m=walk.path_m[stretch],
         )
     return held_out
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from app.field.basis import CosineBasis, VarianceSeries
 from app.field.hyperparameters import Hyperparameters
@@ -16,7 +17,7 @@ from app.field.kernels import spectral_density
 from app.field.statistics import Evidence
 from app.geometry import Array
 
-__all__ = ["LatticeField", "TilePosterior", "posterior"]
+__all__ = ["LatticeField", "TilePosterior", "posterior", "predict"]
 
 
 class LatticeField(NamedTuple):
@@ -59,12 +60,30 @@ class TilePosterior:
 
 def posterior(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> TilePosterior:
     """The posterior of one tile given the sum of its surveys' evidence."""
+    root, factor = _factor(basis, evidence, hyper)
+    weights_uT = root[:, None] * cho_solve((factor, True), root[:, None] * evidence.target, check_finite=False)
+    lower, info = dpotri(factor, lower=1)
+    assert info == 0, info
+    covariance = (lower + np.tril(lower, -1).T) * np.outer(root, root)
+    return TilePosterior(basis, weights_uT, VarianceSeries.of(basis, covariance), hyper.detail_ratio(basis))
+
+
+def predict(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters, points_m: Array) -> tuple[Array, Array]:
+    """`posterior(...).at(points_m)` for a few points: mean (n, c) about the ambient in uT, variance ratio (n,)."""
+    root, factor = _factor(basis, evidence, hyper)
+    scaled = (basis.at(points_m) * root).T
+    right = np.column_stack([root[:, None] * evidence.target, scaled])
+    half = solve_triangular(factor, right, lower=True, check_finite=False)
+    components = evidence.target.shape[1]
+    variance = np.sum(np.square(half[:, components:]), axis=0) + hyper.detail_ratio(basis)
+    return half[:, components:].T @ half[:, :components], np.minimum(variance, 1.0)
+
+
+def _factor(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> tuple[Array, Array]:
+    """Prior sds (m,) of the weights, and the lower Cholesky factor (m, m) of their scaled posterior precision."""
     root = np.sqrt(spectral_density(hyper.kernel, basis.frequencies_squared, hyper.length_m))
     precision = evidence.gram * np.outer(root, root)
     precision[np.diag_indices_from(precision)] += 1.0
-    factor, info = dpotrf(precision, lower=1, clean=1)
+    factor, info = dpotrf(precision, lower=1, clean=1, overwrite_a=1)
     assert info == 0, info
-    inverse, _ = dtrtri(factor, lower=1)
-    scaled = inverse * root
-    weights_uT = scaled.T @ (scaled @ evidence.target)
-    return TilePosterior(basis, weights_uT, VarianceSeries.of(basis, scaled.T @ scaled), hyper.detail_ratio(basis))
+    return root, np.asarray(factor)

@@ -1,6 +1,6 @@
 """Learning the hyper-parameters of a map on a few of its tiles."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from app.field.hyperparameters import Hyperparameters
 from app.field.marginal_likelihood import START_LOG, TileStatistics, learn
 from app.field.observations import Walk
 from app.field.spec import Kernel, Progress
-from app.field.statistics import statistics_by_tile
+from app.field.statistics import TiledWalks
 from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WHITE
 from app.geometry import Array
@@ -42,17 +42,13 @@ def learn_hyperparameters(
 
 
 def _tile_statistics(lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> list[TileStatistics]:
-    chosen = _well_walked(lattice, walks)
-    statistics = statistics_by_tile(lattice, walks, ambient_uT, WHITE, chosen)
-    return [TileStatistics(lattice.basis(tile), surveys) for tile, surveys in statistics.items()]
+    tiled = TiledWalks(lattice, walks, ambient_uT)
+    chosen = _well_walked(tiled.counts())
+    return [TileStatistics(lattice.basis(tile), tiled.statistics(tile, WHITE)) for tile in chosen]
 
 
-def _well_walked(lattice: Lattice, walks: Sequence[Walk]) -> list[Tile]:
+def _well_walked(counts: Mapping[Tile, int]) -> list[Tile]:
     """Of the tiles in the upper half by number of observations, a few spread evenly over the lattice."""
-    counts: dict[Tile, int] = {}
-    for walk in walks:
-        for tile, inside in lattice.fitting(walk.position_m[:, :2]).items():
-            counts[tile] = counts.get(tile, 0) + len(inside)
     by_count = sorted(counts, key=lambda tile: (-counts[tile], tile))
     upper = sorted(by_count[: max(LEARNING_TILES, len(by_count) // 2)])
     picks = np.unique(np.linspace(0, len(upper) - 1, LEARNING_TILES).round().astype(int))

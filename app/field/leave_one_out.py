@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.field.hilbert import posterior
+from app.field.hilbert import predict
 from app.field.hyperparameters import Hyperparameters
 from app.field.observations import Walk
 from app.field.spec import Score
@@ -51,14 +51,14 @@ class HeldOut:
 
 
 class HeldOutPrediction:
-    """Predictions at every walk's samples from the other walks, gathered tile by tile."""
+    """Predictions at every walk's observations from the other walks, gathered tile by tile."""
 
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], hyper: Hyperparameters) -> None:
         self._lattice, self._hyper = lattice, hyper
         self._walks = {walk.survey_id: walk for walk in walks}
-        self._answering = {walk.survey_id: lattice.answering(walk.sample_position_m[:, :2]) for walk in walks}
-        self.mean_uT = {walk.survey_id: np.zeros(walk.sample_field_uT.shape) for walk in walks}
-        self.variance_ratio = {walk.survey_id: np.ones(len(walk.sample_field_uT)) for walk in walks}
+        self._answering = {walk.survey_id: lattice.answering(walk.position_m[:, :2]) for walk in walks}
+        self.mean_uT = {walk.survey_id: np.zeros(walk.field_uT.shape) for walk in walks}
+        self.variance_ratio = {walk.survey_id: np.ones(len(walk)) for walk in walks}
 
     def add(self, tile: Tile, evidence: Mapping[str, Evidence], total: Evidence) -> None:
         """Predict the walks that cross this tile, each from the evidence of the others."""
@@ -67,8 +67,8 @@ class HeldOutPrediction:
             inside = self._answering[survey_id].get(tile)
             if inside is None or len(evidence) == 1:
                 continue
-            points_m = self._walks[survey_id].sample_position_m[inside, :2]
-            mean_uT, variance_ratio = posterior(basis, total - own, self._hyper).at(points_m)
+            points_m = self._walks[survey_id].position_m[inside, :2]
+            mean_uT, variance_ratio = predict(basis, total - own, self._hyper, points_m)
             weight = self._lattice.weight(0, tile, points_m[:, 0]) * self._lattice.weight(1, tile, points_m[:, 1])
             self.mean_uT[survey_id][inside] += weight[:, None] * mean_uT
             self.variance_ratio[survey_id][inside] += weight * (variance_ratio - 1.0)

@@ -28,8 +28,8 @@ class Walk:
     field_uT        (n, c) mean features of each stretch
     path_m          (n,) distance walked
     scatter_uT2     (c,) mean variance of single samples about the mean of their stretch
-    sample_position_m, sample_field_uT   (N, 3), (N, c) the samples themselves
-    stretch_of_sample                    (N,) the observation each sample went into
+    sample_field_uT     (N, c) the features of the samples themselves
+    stretch_of_sample   (N,) the observation each sample went into
     """
 
     survey_id: str
@@ -37,7 +37,6 @@ class Walk:
     field_uT: Array
     path_m: Array
     scatter_uT2: Array
-    sample_position_m: Array
     sample_field_uT: Array
     stretch_of_sample: NDArray[np.int64]
 
@@ -73,7 +72,7 @@ def _average(survey_id: str, samples: Samples, components: Components, stretch_m
     steps = np.linalg.norm(np.diff(position_m[:, :2], axis=0), axis=1)
     path_m = np.concatenate([[0.0], np.cumsum(steps)])
     stretch_of_sample = np.repeat(np.arange(len(starts)), counts)
-    return Walk(survey_id, position_m, mean, path_m, scatter, position, field_uT, stretch_of_sample)
+    return Walk(survey_id, position_m, mean, path_m, scatter, field_uT, stretch_of_sample)
 
 
 def _stretch_starts(position_m: Array, stretch_m: float) -> NDArray[np.int64]:

@@ -6,10 +6,11 @@ survey's constant offset inside the tile, of prior variance `bias_ratio` beside 
 integrated out in closed form afterwards (Sherman-Morrison), so offsets cost nothing and no sample is read again.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
 from app.field.basis import CosineBasis
@@ -18,7 +19,7 @@ from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WalkNoise, whiten
 from app.geometry import Array
 
-__all__ = ["Evidence", "SurveyStatistics", "marginalise", "statistics_by_tile", "survey_statistics"]
+__all__ = ["Evidence", "SurveyStatistics", "TiledWalks", "marginalise", "survey_statistics"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,26 +75,32 @@ def survey_statistics(
     )
 
 
-def statistics_by_tile(
-    lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array, noise: WalkNoise, tiles: Iterable[Tile]
-) -> dict[Tile, dict[str, SurveyStatistics]]:
-    """Tile -> survey id -> statistics, for the tiles asked for, in order of survey id."""
-    members = {walk.survey_id: lattice.fitting(walk.position_m[:, :2]) for walk in walks}
-    result: dict[Tile, dict[str, SurveyStatistics]] = {}
-    for tile in tiles:
-        basis = lattice.basis(tile)
-        result[tile] = {}
+class TiledWalks:
+    """Walks cut up by the tiles of a lattice."""
+
+    def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> None:
+        self.lattice = lattice
+        self._walks = {walk.survey_id: walk for walk in walks}
+        self._ambient_uT = ambient_uT
+        self._members: dict[Tile, dict[str, NDArray[np.int64]]] = {}
         for walk in walks:
-            inside = members[walk.survey_id].get(tile)
-            if inside is not None:
-                result[tile][walk.survey_id] = survey_statistics(
-                    basis,
-                    walk.position_m[inside, :2],
-                    walk.field_uT[inside] - ambient_uT,
-                    walk.path_m[inside],
-                    noise,
-                )
-    return result
+            for tile, inside in lattice.fitting(walk.position_m[:, :2]).items():
+                self._members.setdefault(tile, {})[walk.survey_id] = inside
+
+    def counts(self) -> dict[Tile, int]:
+        """Tile -> observations it is fitted from, in order of tile."""
+        return {tile: sum(map(len, self._members[tile].values())) for tile in sorted(self._members)}
+
+    def statistics(self, tile: Tile, noise: WalkNoise) -> dict[str, SurveyStatistics]:
+        """Survey id -> statistics of the surveys that cross the tile, in the walks' order."""
+        basis = self.lattice.basis(tile)
+        result: dict[str, SurveyStatistics] = {}
+        for survey_id, inside in self._members[tile].items():
+            walk = self._walks[survey_id]
+            deviation_uT = walk.field_uT[inside] - self._ambient_uT
+            points_m, path_m = walk.position_m[inside, :2], walk.path_m[inside]
+            result[survey_id] = survey_statistics(basis, points_m, deviation_uT, path_m, noise)
+        return result
 
 
 def marginalise(survey: SurveyStatistics, white_ratio: float, bias_ratio: float) -> Evidence:

@@ -6,6 +6,7 @@ across the overlap and sum to 1 everywhere.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -88,9 +89,11 @@ class Lattice:
             tile = home + np.asarray(step) - 1
             near = np.flatnonzero(np.all((scaled >= tile - reach) & (scaled <= tile + 1 + reach), axis=1))
             order = near[np.lexsort((near, tile[near, 1], tile[near, 0]))]
-            cuts = np.flatnonzero(np.any(np.diff(tile[order], axis=0), axis=1)) + 1
-            for group in np.split(order, cuts) if len(order) else []:
-                members.setdefault(Tile(int(tile[group[0], 0]), int(tile[group[0], 1])), []).append(group)
+            changes = np.any(tile[order[1:]] != tile[order[:-1]], axis=1)
+            cuts = [0, *(np.flatnonzero(changes) + 1).tolist(), len(order)]
+            for start, stop in pairwise(cuts if len(order) else []):
+                column, row = tile[order[start]].tolist()
+                members.setdefault(Tile(column, row), []).append(order[start:stop])
         return {tile: np.sort(np.concatenate(members[tile])) for tile in sorted(members)}
 
 

@@ -1,10 +1,11 @@
-"""A room of random magnetic dipoles below the floor and above the ceiling: curl- and divergence-free where one walks."""
+"""A room of random dipoles below the floor and above the ceiling: curl- and divergence-free where one walks."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from app.field.samples import Samples
 
@@ -69,3 +70,10 @@ class Room:
 @pytest.fixture
 def room() -> Room:
     return Room.random(np.random.default_rng(7))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_blas_thread():
+    """Threads only slow small matrices down, badly so on a busy machine."""
+    with threadpool_limits(1):
+        yield
