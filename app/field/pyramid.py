@@ -1,11 +1,13 @@
 """Sliding-window bounds of a gridded field: the smallest and largest value in any square of 2^l cells.
 
-Level l answers for the square of side s = 2^l whose first cell is (j, i), for every start from -s (wholly before the
-grid) to n (wholly behind it): one lookup whatever the displacement of a block of poses. Cells off the grid hold the
-prior. Variances are kept as one-byte codes of a logarithmic ladder, rounded outwards, so that they stay bounds.
+Level l answers for the square of side s = 2^l whose first cell is (j, i), wherever that lies: one lookup whatever the
+displacement of a block of poses. Starts are kept every q = max(1, s / 4) cells, for squares that much larger, so that
+high levels stay small enough for the processor's caches. Cells off the grid hold the prior. Variances are kept as
+one-byte codes of a logarithmic ladder, rounded outwards, beside the bounds of the mean in the same record.
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numba
 import numpy as np
@@ -13,33 +15,42 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["LADDER_STEPS", "Pyramid", "build_pyramid", "variance_ladder"]
+__all__ = ["LADDER_STEPS", "Level", "Pyramid", "build_pyramid", "variance_ladder"]
 
-LADDER_STEPS = 256
+LADDER_STEPS = 64
 Float32 = NDArray[np.float32]
 Codes = NDArray[np.uint8]
+_Cells = TypeVar("_Cells", Float32, Codes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """Bounds over squares of `side` cells: that at (j, i) is in record [(j + base) // step, (i + base) // step].
+
+    records   (h, w, 2 c + ceil(c / 2)) float32: c lower then c upper bounds of the mean, uT, then, byte by byte, the
+              ladder positions at or below (c) and at or above (c) every variance in the square
+    step      cells between records, a power of two; base = side + step. Indices beyond the array: the nearest record
+    """
+
+    side: int
+    step: int
+    records: Float32
+
+    @property
+    def base(self) -> int:
+        return self.side + self.step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """Bounds of all levels, flat, level by level, rows of `height[l] x width[l]` starts.
+    """levels[l - 1] holds squares of 2^l cells; ladder_uT2 (c, LADDER_STEPS) ascends from the smallest variance."""
 
-    mean_bounds   (sum_l height width, 2 c) float32: c lower then c upper bounds of the mean, uT
-    code_bounds   (same, 2 c) uint8: positions on `ladder_uT2` that enclose the variance
-    ladder_uT2    (c, LADDER_STEPS) variances, ascending; the first is the smallest in the grid
-    start, height, width   (levels,) int64
-    """
-
-    mean_bounds: Float32
-    code_bounds: Codes
+    levels: tuple[Level, ...]
     ladder_uT2: Array
-    start: NDArray[np.int64]
-    height: NDArray[np.int64]
-    width: NDArray[np.int64]
 
     @property
     def nbytes(self) -> int:
-        return self.mean_bounds.nbytes + self.code_bounds.nbytes + self.ladder_uT2.nbytes
+        return self.ladder_uT2.nbytes + sum(level.records.nbytes for level in self.levels)
 
 
 def variance_ladder(variance_uT2: Array | Float32) -> Array:
@@ -52,56 +63,67 @@ def variance_ladder(variance_uT2: Array | Float32) -> Array:
 
 
 def build_pyramid(mean_uT: Float32, variance_uT2: Float32, levels: int) -> Pyramid:
-    """Levels 0 to `levels` of a field (ny + 2, nx + 2, c) that already carries one cell of prior on each side."""
+    """Levels 1 to `levels` of a field (ny + 2, nx + 2, c) that already carries one cell of prior on each side."""
     ladder = variance_ladder(variance_uT2)
-    ny, nx, c = mean_uT.shape[0] - 2, mean_uT.shape[1] - 2, mean_uT.shape[2]
-    sides = [1 << level for level in range(levels + 1)]
-    height = np.array([ny + s + 1 for s in sides], dtype=np.int64)
-    width = np.array([nx + s + 1 for s in sides], dtype=np.int64)
-    start = np.concatenate([[0], np.cumsum(height * width)]).astype(np.int64)
-    bounds = np.empty((start[-1], 2 * c), dtype=np.float32)
-    codes = np.empty((start[-1], 2 * c), dtype=np.uint8)
-    cells = mean_uT.reshape(-1, c)
-    bounds[: start[1], :c], bounds[: start[1], c:] = cells, cells
-    codes[: start[1]] = _codes(variance_uT2.reshape(-1, c).astype(np.float64), ladder)
+    bounds, codes = np.concatenate([mean_uT, mean_uT], axis=2), _codes(variance_uT2.astype(np.float64), ladder)
+    built = []
     for level in range(1, levels + 1):
-        lower, here = slice(start[level - 1], start[level]), slice(start[level], start[level + 1])
-        shape = (int(height[level - 1]), int(width[level - 1]), 2 * c)
-        new = (int(height[level]), int(width[level]), 2 * c)
-        _double(bounds[lower].reshape(shape), bounds[here].reshape(new), sides[level])
-        _double(codes[lower].reshape(shape), codes[here].reshape(new), sides[level])
-    return Pyramid(bounds, codes, ladder, start[:-1], height, width)
+        side = 1 << level
+        bounds, codes = _doubled(bounds, side), _doubled(codes, side)
+        step = max(1, side // 4)
+        built.append(Level(side, step, _records(_thinned(bounds, side, step), _thinned(codes, side, step))))
+    return Pyramid(tuple(built), ladder)
+
+
+def _records(bounds: Float32, codes: Codes) -> Float32:
+    c = bounds.shape[2] // 2
+    records = np.zeros((*bounds.shape[:2], 2 * c + (c + 1) // 2), dtype=np.float32)
+    records[..., : 2 * c] = bounds
+    records.view(np.uint8)[..., 8 * c : 10 * c] = codes
+    return records
 
 
 def _codes(variance: Array, ladder: Array) -> Codes:
-    """(cells, 2 c) ladder positions at or below, and at or above, each variance."""
+    """(ny, nx, 2 c) ladder positions at or below, and at or above, each variance."""
     c = ladder.shape[0]
-    codes = np.empty((len(variance), 2 * c), dtype=np.uint8)
+    codes = np.zeros((*variance.shape[:2], 2 * c), dtype=np.uint8)
     for k in range(c):
-        below = np.searchsorted(ladder[k], variance[:, k], side="right") - 1
-        above = np.searchsorted(ladder[k], variance[:, k], side="left")
-        codes[:, k] = np.clip(below, 0, LADDER_STEPS - 1)
-        codes[:, c + k] = np.clip(above, 0, LADDER_STEPS - 1)
-    if np.any(ladder[:, 0] == ladder[:, -1]):
-        codes[:, c:][:, ladder[:, 0] == ladder[:, -1]] = 0
-        codes[:, :c][:, ladder[:, 0] == ladder[:, -1]] = 0
+        if ladder[k, 0] < ladder[k, -1]:
+            codes[..., k] = np.searchsorted(ladder[k], variance[..., k], side="right") - 1
+            codes[..., c + k] = np.searchsorted(ladder[k], variance[..., k], side="left")
     return codes
 
 
-@numba.njit(cache=True, nogil=True)
-def _double(below, above, side):  # type: ignore[no-untyped-def]
-    """Squares of `side` cells from four squares of half the side; starts are clamped where both lie off the grid."""
+def _doubled(below: _Cells, side: int) -> _Cells:
+    """Every square of `side` cells, starts -side to n, from every square of half the side."""
     half = side // 2
-    rows, columns, width = above.shape
-    last_row, last_column = below.shape[0] - 1, below.shape[1] - 1
+    above = np.empty((below.shape[0] + half, below.shape[1] + half, below.shape[2]), dtype=below.dtype)
+    _cover(below, above, 1, -half, half)
+    return above
+
+
+def _thinned(squares: _Cells, side: int, step: int) -> _Cells:
+    """Squares of side + step - 1 cells, starts -(side + step) to n + step, every `step`."""
+    ny, nx, width = squares.shape[0] - side - 1, squares.shape[1] - side - 1, squares.shape[2]
+    rows, columns = ((n + side + 2 * step) // step + 1 for n in (ny, nx))
+    thin = np.empty((rows, columns, width), dtype=squares.dtype)
+    _cover(squares, thin, step, -step, step - 1)
+    return thin
+
+
+@numba.njit(cache=True, nogil=True)
+def _cover(squares, target, step, first, apart):  # type: ignore[no-untyped-def]
+    """target[j] = the union of the squares at step j + first and `apart` behind it, on both axes, indices clamped."""
+    rows, columns, width = target.shape
+    last_row, last_column = squares.shape[0] - 1, squares.shape[1] - 1
     c = width // 2
     for j in range(rows):
-        j0 = min(max(j - half, 0), last_row)
-        j1 = min(j, last_row)
+        j0 = min(max(step * j + first, 0), last_row)
+        j1 = min(max(step * j + first + apart, 0), last_row)
         for i in range(columns):
-            i0 = min(max(i - half, 0), last_column)
-            i1 = min(i, last_column)
+            i0 = min(max(step * i + first, 0), last_column)
+            i1 = min(max(step * i + first + apart, 0), last_column)
             for k in range(width):
-                a, b = below[j0, i0, k], below[j0, i1, k]
-                d, e = below[j1, i0, k], below[j1, i1, k]
-                above[j, i, k] = min(min(a, b), min(d, e)) if k < c else max(max(a, b), max(d, e))
+                a, b = squares[j0, i0, k], squares[j0, i1, k]
+                d, e = squares[j1, i0, k], squares[j1, i1, k]
+                target[j, i, k] = min(min(a, b), min(d, e)) if k < c else max(max(a, b), max(d, e))

@@ -13,7 +13,7 @@ from app.positioning.features import reduce_field, reduce_variance
 
 __all__ = ["TOP_LEVEL", "Plane", "SearchableFloor", "prepare_floor", "reduce_floor"]
 
-TOP_LEVEL = 4  # the search starts from blocks of 2^4 cells
+TOP_LEVEL = 5  # the search starts from blocks of 2^5 cells
 Float32 = NDArray[np.float32]
 
 

@@ -22,29 +22,35 @@ _SLACK = 1e-9  # relative: what rounding may add to a bound
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _term(squared, low, high, k, c, variance, log_variance):  # type: ignore[no-untyped-def]
-    """Smallest squared / v + log v over the variances between two steps of the ladder."""
-    v_low, v_high = variance[k, c, low], variance[k, c, high]
+def _term(squared, low, high, ladder):  # type: ignore[no-untyped-def]
+    """Smallest squared / v + log(v / v_min) over the variances between two steps of `ladder` (steps, 2)."""
+    v_high = ladder[high, 0]
     if squared >= v_high:
-        return squared / v_high + log_variance[k, c, high]
+        return squared / v_high + ladder[high, 1]
+    v_low = ladder[low, 0]
     if squared <= v_low:
-        return squared / v_low + log_variance[k, c, low]
-    return 1.0 + math.log(squared / variance[k, c, 0])
+        return squared / v_low + ladder[low, 1]
+    return 1.0 + math.log(squared / ladder[0, 0])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _record(j, i, base, shift, height, width):  # type: ignore[no-untyped-def]
+    """Index of the record that covers the square at (j, i)."""
+    a = min(max((j + base) >> shift, 0), height - 1)
+    b = min(max((i + base) >> shift, 0), width - 1)
+    return a * width + b
 
 
 @numba.njit(cache=True, nogil=True)
-def _raw_bound(  # type: ignore[no-untyped-def]
-    start, side, height, width, j, i, z, row, column, kind, bounds, codes, variance, log_variance, cost, stop
-):
+def _raw_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop):  # type: ignore[no-untyped-def]
     """`cost` plus the bound of the block at (j, i); given up as soon as it exceeds `stop`."""
     n, c = z.shape
+    base, shift, height, width = level
     for k in range(n):
-        a = min(max(j + row[k] + side, 0), height - 1)
-        b = min(max(i + column[k] + side, 0), width - 1)
-        at = start + a * width + b
+        at = _record(j + row[k], i + column[k], base, shift, height, width)
         for m in range(c):
-            d = max(max(z[k, m] - bounds[at, c + m], bounds[at, m] - z[k, m]), 0.0)
-            cost += _term(d * d, codes[at, m], codes[at, c + m], kind[k], m, variance, log_variance)
+            d = max(max(z[k, m] - records[at, c + m], records[at, m] - z[k, m]), 0.0)
+            cost += _term(d * d, codes[at, 8 * c + m], codes[at, 9 * c + m], ladder[kind[k], m])
         if cost > stop:
             return cost
     return cost
@@ -103,24 +109,21 @@ def _least_spread(low, high, weight, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _demeaned_bound(  # type: ignore[no-untyped-def]
-    start, side, height, width, j, i, z, row, column, kind, bounds, codes, variance, log_variance, cost, stop
-):
+def _demeaned_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop):  # type: ignore[no-untyped-def]
     """The bound of a block with an offset per component integrated out, compared with `stop` now and then."""
     n, c = z.shape
+    base, shift, height, width = level
     low, high, weight = np.empty((c, n)), np.empty((c, n)), np.empty((c, n))
     logs, ratios = 0.0, np.zeros(c)
     check, total = 3, cost
     for k in range(n):
-        a = min(max(j + row[k] + side, 0), height - 1)
-        b = min(max(i + column[k] + side, 0), width - 1)
-        at = start + a * width + b
+        at = _record(j + row[k], i + column[k], base, shift, height, width)
         for m in range(c):
-            v_low, v_high = codes[at, m], codes[at, c + m]
-            low[m, k], high[m, k] = z[k, m] - bounds[at, c + m], z[k, m] - bounds[at, m]
-            weight[m, k] = 1.0 / variance[kind[k], m, v_high]
-            logs += log_variance[kind[k], m, v_low]
-            ratios[m] += variance[0, m, 0] * weight[m, k]
+            steps = ladder[kind[k], m]
+            low[m, k], high[m, k] = z[k, m] - records[at, c + m], z[k, m] - records[at, m]
+            weight[m, k] = 1.0 / steps[codes[at, 9 * c + m], 0]
+            logs += steps[codes[at, 8 * c + m], 1]
+            ratios[m] += ladder[0, m, 0, 0] * weight[m, k]
         if k + 1 == check or k + 1 == n:
             check *= 2
             total = cost + logs
@@ -184,23 +187,19 @@ def pose_costs(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def block_bounds(  # type: ignore[no-untyped-def]
-    blocks, side, demeaned, z, row, column, kind, ladder, log_ladder, start, height, width, bounds, codes,
-    heading_cost, prior, stop,
-):  # fmt: skip
-    """Lower bounds (p,) of the costs in blocks (p, 3) of (heading, first row, first column), given up beyond `stop`."""
+    blocks, side, demeaned, z, row, column, kind, ladder, level, records, codes, heading_cost, prior, stop
+):
+    """Lower bounds (p,) of the costs in blocks (p, 3) of (heading, first row, first column), given up beyond `stop`.
+
+    ladder (kinds of noise, c, steps, 2) variances and their logs; level = (base, shift, height, width) of the records.
+    """
     found = np.empty(len(blocks))
     for p in range(len(blocks)):
         h, j, i = blocks[p, 0], blocks[p, 1], blocks[p, 2]
         base = heading_cost[h] + _distance_cost(j, i, side, prior)
         if demeaned:
-            bound = _demeaned_bound(
-                start, side, height, width, j, i, z[h], row[h], column[h], kind, bounds, codes, ladder, log_ladder,
-                base, stop,
-            )  # fmt: skip
+            bound = _demeaned_bound(j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop)
         else:
-            bound = _raw_bound(
-                start, side, height, width, j, i, z[h], row[h], column[h], kind, bounds, codes, ladder, log_ladder,
-                base, stop,
-            )  # fmt: skip
+            bound = _raw_bound(j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop)
         found[p] = bound - _SLACK * (1.0 + abs(bound))
     return found

@@ -21,8 +21,7 @@ __all__ = ["CAPACITY", "Candidates", "PosePrior", "search"]
 Blocks = NDArray[np.int32]
 CAPACITY = 400_000  # poses kept at most
 _BLOCKS_PER_POSE = 5  # how many blocks of a level may be followed, per pose of the capacity
-_BEAM = 192
-_BEAM_SAMPLES = 4
+_BEAM = 48
 _NEGLIGIBLE_NATS = 60.0
 _SPARE_NATS = 12.0  # tempered: how far beyond the limit a bound is followed, so that the missed mass comes out small
 
@@ -75,16 +74,17 @@ class _PlaneCosts:
         self.column = np.ascontiguousarray(turned.offset_cells[:, order, 1])
         self.noise = window.noise_variance_uT2[order]
         noises, self.kind = np.unique(self.noise, return_inverse=True)
-        self.ladder = plane.pyramid.ladder_uT2[None] + noises[:, None, None]
-        self.log_ladder = np.log(self.ladder / self.ladder[:, :, :1])
+        ladder = plane.pyramid.ladder_uT2[None] + noises[:, None, None]
+        self.ladder = np.stack([ladder, np.log(ladder / ladder[:, :, :1])], axis=-1)
         self.least = np.ascontiguousarray(plane.pyramid.ladder_uT2[:, 0])
         self.heading_cost = -2.0 * temper * prior.heading_log
         self.prior, height = _prior_in_cells(plane, prior, temper)
         floor = self.least[None, :] + self.noise[:, None]
         n, c = floor.shape
         self.constant = float(np.log(floor).sum() + n * c * np.log(2 * np.pi)) + height
+        self.expected = self.constant + n * c + 5.0 * (2.0 * n * c) ** 0.5  # cost of a pose that matches
         if demeaned:  # one Gaussian factor per component is integrated out
-            self.constant -= float(np.log(2 * np.pi * self.ladder[0, :, 0]).sum())
+            self.constant -= float(np.log(2 * np.pi * ladder[0, :, 0]).sum())
 
     def costs(self, poses: Blocks, stop: float) -> Array:
         p = self.plane
@@ -94,13 +94,14 @@ class _PlaneCosts:
         )  # fmt: skip
         return costs + self.constant
 
-    def bounds(self, blocks: Blocks, level: int, stop: float, samples: int | None = None) -> Array:
-        tree, s = self.plane.pyramid, slice(None, samples)
-        here = slice(int(tree.start[level]), int(tree.start[level] + tree.height[level] * tree.width[level]))
+    def bounds(self, blocks: Blocks, level: int, stop: float) -> Array:
+        squares = self.plane.pyramid.levels[level - 1]
+        height, width, size = squares.records.shape
+        records = squares.records.reshape(-1, size)
+        place = (squares.base, squares.step.bit_length() - 1, height, width)
         bounds: Array = block_bounds(
-            blocks, 1 << level, self.demeaned, self.z[:, s], self.row[:, s], self.column[:, s], self.kind[s],
-            self.ladder, self.log_ladder, 0, tree.height[level], tree.width[level], tree.mean_bounds[here],
-            tree.code_bounds[here], self.heading_cost, self.prior, stop - self.constant,
+            blocks, squares.side, self.demeaned, self.z, self.row, self.column, self.kind, self.ladder, place,
+            records, records.view(np.uint8), self.heading_cost, self.prior, stop - self.constant,
         )  # fmt: skip
         return bounds + self.constant
 
@@ -137,16 +138,17 @@ def search(
 ) -> Candidates:
     """Every pose of the planes within `window_nats` of the best, tempered by `temper` for the missed mass only."""
     costs = [_PlaneCosts(plane, window, headings_rad, prior, temper, demeaned) for plane in planes]
-    seeds = [_incumbent(on_plane) for on_plane in costs]
-    sweep = _Sweep(min(cost for _, cost in seeds), 2.0 * window_nats, temper, capacity // len(planes))
-    found = [sweep.run(on_plane, *seed) for on_plane, seed in zip(costs, seeds, strict=True)]
+    expected = max(on_plane.expected for on_plane in costs) + 2.0 * (window_nats + temper * _SPARE_NATS)
+    starts = [_start(on_plane, expected) for on_plane in costs]
+    sweep = _Sweep(min(start.seed_cost for start in starts), 2.0 * window_nats, temper, capacity // len(planes))
+    found = [sweep.run(on_plane, start) for on_plane, start in zip(costs, starts, strict=True)]
     plane = np.concatenate([np.full(len(poses), k) for k, (poses, _) in enumerate(found)])
     poses = np.concatenate([poses for poses, _ in found]).astype(np.int64)
     cost = np.concatenate([cost for _, cost in found])
     inside = cost <= sweep.best + sweep.window
     order = np.flatnonzero(inside)
     order = order[np.lexsort((poses[order, 2], poses[order, 1], poses[order, 0], plane[order], cost[order]))]
-    sweep.miss(cost[~inside], np.ones(int((~inside).sum())))
+    sweep.miss_poses(cost[~inside])
     return Candidates(
         plane=plane[order],
         heading=poses[order, 0],
@@ -154,7 +156,7 @@ def search(
         column=poses[order, 2],
         score=-0.5 * cost[order],
         window_nats=0.5 * sweep.window,
-        missed_mass=sweep.missed_mass(),
+        missed_mass=sweep.missed_mass,
         poses=len(headings_rad) * sum(p.shape[0] * p.shape[1] for p in planes),
     )
 
@@ -164,35 +166,50 @@ class _Sweep:
 
     def __init__(self, best: float, window: float, temper: float, capacity: int) -> None:
         self.best, self.window, self.temper, self.capacity = best, window, temper, max(capacity, 1)
-        self._reference, self._missed = best, 0.0
+        self.missed_mass = 0.0  # at most, relative to the best pose
 
-    def run(self, on_plane: _PlaneCosts, seed: Blocks, seed_cost: float) -> tuple[Blocks, Array]:
+    def run(self, on_plane: _PlaneCosts, start: "_Start") -> tuple[Blocks, Array]:
         """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
-        blocks = on_plane.top_blocks()
+        blocks, bounds = start.blocks, start.bounds
+        if self._stop() > start.followed_to:
+            again = bounds <= self._stop()
+            bounds[again] = on_plane.bounds(blocks[again], TOP_LEVEL, self._stop())
         for level in range(TOP_LEVEL, 0, -1):
-            bounds = on_plane.bounds(blocks, level, self._stop())
+            if level < TOP_LEVEL:
+                bounds = on_plane.bounds(blocks, level, self._stop())
             keep = self._keep(bounds, _BLOCKS_PER_POSE * self.capacity)
-            self.miss(bounds[~keep], on_plane.cells(blocks[~keep], level))
+            self.miss(on_plane, blocks, bounds, ~keep, level)
             blocks = on_plane.split(blocks[keep], level)
+        seed, seed_cost = start.seed, start.seed_cost
         seeded = np.flatnonzero((blocks == seed).all(axis=1))
         blocks = np.concatenate([seed, np.delete(blocks, seeded, axis=0)])
         costs = on_plane.costs(blocks, self._stop())
         costs[0] = seed_cost
-        self.best = min(self.best, float(costs.min()))
+        self._improve(float(costs.min()))
         keep = self._keep(costs, self.capacity)
         keep[np.argmin(costs)] = True
-        self.miss(costs[~keep], np.ones(int((~keep).sum())))
+        self.miss(on_plane, blocks, costs, ~keep, 0)
         return blocks[keep], costs[keep]
 
-    def missed_mass(self) -> float:
-        """What was left out at most, relative to the best pose."""
-        return self._missed * float(np.exp((self.best - self._reference) / (2 * self.temper)))
-
-    def miss(self, bounds: Array, cells: Array) -> None:
+    def miss(
+        self, on_plane: _PlaneCosts, blocks: Blocks, bounds: Array, left_out: NDArray[np.bool_], level: int
+    ) -> None:
         """Count blocks that are left out, by their bounds."""
-        relative = (bounds - self._reference) / (2.0 * self.temper)
-        near = relative < _NEGLIGIBLE_NATS
-        self._missed += float(np.sum(cells[near] * np.exp(-relative[near])))
+        near = np.flatnonzero(left_out & (bounds < self.best + 2.0 * self.temper * _NEGLIGIBLE_NATS))
+        self.missed_mass += float(np.sum(on_plane.cells(blocks[near], level) * self._mass(bounds[near])))
+
+    def miss_poses(self, costs: Array) -> None:
+        """Count poses that are left out in the end."""
+        self.missed_mass += float(np.sum(self._mass(costs)))
+
+    def _improve(self, cost: float) -> None:
+        if cost < self.best:
+            self.missed_mass *= float(np.exp((cost - self.best) / (2.0 * self.temper)))
+            self.best = cost
+
+    def _mass(self, costs: Array) -> Array:
+        """Tempered posterior mass relative to the best pose so far."""
+        return np.asarray(np.exp(np.minimum((self.best - costs) / (2.0 * self.temper), 300.0)))
 
     def _stop(self) -> float:
         return self.best + self.window + 2.0 * self.temper * _SPARE_NATS
@@ -211,17 +228,29 @@ class _Sweep:
         return keep
 
 
-def _incumbent(on_plane: _PlaneCosts) -> tuple[Blocks, float]:
-    """A good pose (1, 3) and its cost: follow the most promising blocks down."""
-    blocks = on_plane.top_blocks()
-    bounds = on_plane.bounds(blocks, TOP_LEVEL, np.inf, _BEAM_SAMPLES)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """The top blocks with their bounds, followed up to `followed_to`, and a good pose (1, 3) as first incumbent."""
+
+    blocks: Blocks
+    bounds: Array
+    followed_to: float
+    seed: Blocks
+    seed_cost: float
+
+
+def _start(on_plane: _PlaneCosts, expected: float) -> _Start:
+    """Bound the top blocks as far as a matching window needs it, and follow the most promising down to a pose."""
+    top = on_plane.top_blocks()
+    top_bounds = on_plane.bounds(top, TOP_LEVEL, expected)
+    blocks, bounds = top, top_bounds
     for level in range(TOP_LEVEL, 0, -1):
         if len(blocks) > _BEAM:
             blocks = blocks[np.argpartition(bounds, _BEAM)[:_BEAM]]
         blocks = on_plane.split(blocks, level)
         bounds = on_plane.bounds(blocks, level - 1, np.inf) if level > 1 else on_plane.costs(blocks, np.inf)
     best = int(np.argmin(bounds))
-    return blocks[best : best + 1], float(bounds[best])
+    return _Start(top, top_bounds, expected, blocks[best : best + 1], float(bounds[best]))
 
 
 def _prior_in_cells(plane: Plane, prior: PosePrior, temper: float) -> tuple[Array, float]:

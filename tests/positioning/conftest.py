@@ -41,7 +41,7 @@ def make_grid(
         [[gaussian_filter(rng.normal(size=shape), sigma, mode="wrap") for _ in range(c)] for _ in range(nz)], axis=0
     )
     field = np.moveaxis(field, 1, -1)
-    field *= field_sd_uT / np.maximum(field.std(axis=(1, 2), keepdims=True), 1e-12)
+    field *= field_sd_uT / np.maximum(field.std(axis=(1, 2), keepdims=True), 0.01)
     mean = field + AMBIENT[components]
     gradient = np.stack([np.gradient(mean, resolution_m, axis=2), np.gradient(mean, resolution_m, axis=1)], axis=-1)
     patches = gaussian_filter(rng.normal(size=(nz, *shape)), (0, 4, 4), mode="wrap")

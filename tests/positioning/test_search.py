@@ -157,18 +157,23 @@ def test_pyramid_bounds_enclose_every_square(ny: int, nx: int) -> None:
     variance = rng.uniform(0.1, 30.0, size=(ny + 2, nx + 2, 2)).astype(np.float32)
     for border in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
         mean[border], variance[border] = 7.0, 40.0
-    tree = build_pyramid(mean, variance, 3)
-    for level in range(4):
-        side, h, w = 1 << level, int(tree.height[level]), int(tree.width[level])
-        at = slice(int(tree.start[level]), int(tree.start[level]) + h * w)
-        bounds, codes = tree.mean_bounds[at].reshape(h, w, 4), tree.code_bounds[at].reshape(h, w, 4)
-        big_mean = np.pad(mean[1:-1, 1:-1], ((side, side), (side, side), (0, 0)), constant_values=7.0)
-        big_variance = np.pad(variance[1:-1, 1:-1], ((side, side), (side, side), (0, 0)), constant_values=40.0)
-        for j in range(h):
-            for i in range(w):
-                square = big_mean[j : j + side, i : i + side].reshape(-1, 2)
-                spread = big_variance[j : j + side, i : i + side].reshape(-1, 2)
-                np.testing.assert_array_equal(bounds[j, i], np.concatenate([square.min(axis=0), square.max(axis=0)]))
+    tree = build_pyramid(mean, variance, 4)
+    pad = 40
+    big_mean, big_variance = (np.pad(a[1:-1, 1:-1], ((pad, pad), (pad, pad), (0, 0)), constant_values=value)
+                              for a, value in ((mean, 7.0), (variance, 40.0)))  # fmt: skip
+    for level in tree.levels:
+        codes = level.records.view(np.uint8)[..., 16:20]
+        height, width = codes.shape[:2]
+        for j in range(-level.side - 3, ny + 3):
+            for i in range(-level.side - 3, nx + 3):
+                at = tuple(min(max((k + level.base) // level.step, 0), n - 1) for k, n in ((j, height), (i, width)))
+                square = np.s_[j + pad : j + pad + level.side, i + pad : i + pad + level.side]
+                low, high = big_mean[square].min(axis=(0, 1)), big_mean[square].max(axis=(0, 1))
+                assert (level.records[at][:2] <= low).all()
+                assert (level.records[at][2:4] >= high).all()
+                if level.step == 1:
+                    np.testing.assert_array_equal(level.records[at][:4], np.concatenate([low, high]))
+                least, most = big_variance[square].min(axis=(0, 1)), big_variance[square].max(axis=(0, 1))
                 for c in range(2):
-                    assert tree.ladder_uT2[c, codes[j, i, c]] <= spread[:, c].min()
-                    assert tree.ladder_uT2[c, codes[j, i, 2 + c]] >= spread[:, c].max()
+                    assert tree.ladder_uT2[c, codes[at][c]] <= least[c]
+                    assert tree.ladder_uT2[c, codes[at][2 + c]] >= most[c]
