@@ -22,7 +22,7 @@ from app.viewer.layers import LAYERS, ColourScale, colour_scale, layer_names, la
 from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
 
 if TYPE_CHECKING:
-    from viser import ClientHandle, FrameHandle
+    from viser import ClientHandle, FrameHandle, GuiEvent
 
     from app.viewer.content import OrganisationContent
 
@@ -98,16 +98,21 @@ class ClientView:
             self._explode = gui.add_slider("Pull apart", 0.0, 40.0, 0.5, 0.0, hint="Metres added between floors.")
         views = gui.add_button_group("View", ["Oblique", "From above"])
         self._shown = shown
-        self._building.on_update(lambda _: self._safely(self._on_building))
+        self._building.on_update(lambda event: self._safely(event, self._on_building))
         for control in (self._floor, self._layer, self._height, self._spacing):
-            control.on_update(lambda _: self._safely(self._redraw_when_changed))
+            control.on_update(lambda event: self._safely(event, self._redraw_when_changed))
         for box in shown.values():
-            box.on_update(lambda _: self._safely(self._apply_visibility))
-        self._explode.on_update(lambda _: self._safely(self._apply_explosion))
-        views.on_click(lambda _: self._safely(lambda: self._move_camera(top=views.value == "From above")))
+            box.on_update(lambda event: self._safely(event, self._apply_visibility))
+        self._explode.on_update(lambda event: self._safely(event, self._apply_explosion))
+        views.on_click(lambda event: self._safely(event, lambda: self._move_camera(top=views.value == "From above")))
 
-    def _safely(self, action: Callable[[], None]) -> None:
-        """Run a control's action; what goes wrong is told to this client in a sentence."""
+    def _safely(self, event: GuiEvent[Any], action: Callable[[], None]) -> None:
+        """Run a control's action; what goes wrong is told to this client in a sentence.
+
+        viser also calls back for the values this class sets itself; those events name no client and are passed over.
+        """
+        if event.client is None:
+            return
         try:
             with self._lock:
                 action()
@@ -119,7 +124,7 @@ class ClientView:
         self._redraw(move_camera=True)
 
     def _redraw_when_changed(self) -> None:
-        """Redraw unless the choice is the one drawn: viser also reports the values this class sets itself."""
+        """Redraw unless the choice is the one drawn: events queue up while a slider is dragged."""
         if self._choice() != self._drawn:
             self._redraw()
 
@@ -247,7 +252,9 @@ class ClientView:
             frame.position = (0.0, 0.0, rank * float(self._explode.value))
 
     def _move_camera(self, top: bool = False) -> None:
-        spread_m = float(self._explode.value) * max(len(self._grids) - 1, 0)
+        highest_map_m = max((float(grid.heights_m[-1]) for grid in self._grids), default=0.0)
+        highest_m = max([highest_map_m, *(floor.elevation_m for floor in self._current_floors())])
+        spread_m = float(self._explode.value) * max(len(self._frames) - 1, 0) + highest_m - highest_map_m
         position, target = draw.camera_pose(self._grids, self._origin_m, top, spread_m)
         camera = self._client.camera
         with self._client.atomic():
@@ -265,7 +272,7 @@ class ClientView:
             low, middle, high = np.nanpercentile(s.values, [5.0, 50.0, 95.0])
             area_m2 = np.isfinite(s.values).sum() * s.grid.resolution_m**2
             lines.append(
-                f"**{name}** median {middle:.1f} {unit}, 90 % in {low:.1f} to {high:.1f}; "
+                f"**{name}** median {middle:.3g} {unit}, 90 % in {low:.3g} to {high:.3g}; "
                 f"{area_m2:,.0f} m² measured, {_walks(len(s.walks))}"
             )
         squares = f"Ground squares are {draw.ground_cell_m(self._grids):g} m."

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from urllib.parse import parse_qs, quote, urlsplit
 
+import httpx
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route, Router, WebSocketRoute
@@ -95,8 +96,14 @@ class ViewerApp:
         if request.query_params or request.url.path != address:
             return RedirectResponse(address, HTTPStatus.SEE_OTHER)
         async with self.pool.visit(session.organisation_id) as viewer:
-            if self._page is None:  # the same for every organisation
-                self._page = await fetch_page(viewer.http_url, _prefix(request))
+            try:
+                if self._page is None:  # the same for every organisation
+                    self._page = await fetch_page(viewer.http_url, _prefix(request))
+            except httpx.TransportError:
+                await self.pool.discard(session.organisation_id, viewer)
+                return _refusal(
+                    HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting again; load this page once more"
+                )
         return _page_response(self._page, request)
 
     async def _sign_in(self, request: Request) -> Response:
@@ -153,7 +160,9 @@ class ViewerApp:
         ended = asyncio.ensure_future(self.signed_in.until_ended(session))
         try:
             async with self.pool.visit(session.organisation_id) as viewer:
-                await relay(websocket, viewer.websocket_url(_link(websocket.path_params, {})), ended)
+                reached = await relay(websocket, viewer.websocket_url(_link(websocket.path_params, {})), ended)
+            if not reached:
+                await self.pool.discard(session.organisation_id, viewer)
         finally:
             ended.cancel()
 

@@ -87,18 +87,19 @@ def passes(message: bytes) -> bool:
     return True
 
 
-async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[None]) -> None:
+async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[None]) -> bool:
     """Accept a browser and pass messages both ways until either side closes or `ended` is done (signed out).
 
-    Sending waits for the receiver, so a slow browser slows its own stream only.
+    Sending waits for the receiver, so a slow browser slows its own stream only. Returns False when viser could not be
+    reached; the browser is then told to try again.
     """
     offered = [Subprotocol(p) for p in browser.scope.get("subprotocols", ()) if p.startswith("viser-v")]
     try:
         upstream = await _connect(upstream_url, offered)
     except (OSError, WebSocketException, TimeoutError):
         await browser.accept()
-        await browser.close(CLOSE_UNREACHABLE, "the viewer is not running; load the page again")
-        return
+        await browser.close(CLOSE_UNREACHABLE, "the viewer is not running; it is being started again")
+        return False
     async with upstream:
         await browser.accept(subprotocol=upstream.subprotocol)
         towards_viser = asyncio.create_task(_towards_viser(browser, upstream))
@@ -111,6 +112,7 @@ async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[Non
                 task.cancel()
             await asyncio.gather(*flows, return_exceptions=True)
         await _close_browser(browser, upstream, signed_out=ended.done())
+    return True
 
 
 async def _connect(url: str, subprotocols: Sequence[Subprotocol]) -> ClientConnection:

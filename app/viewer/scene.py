@@ -49,6 +49,7 @@ MAX_POINTS = 300_000
 MAX_ARROWS = 20_000
 _MAX_WALK_SEGMENTS = 60_000
 _USUAL_ARROWS = 320
+_LIGHT_COMPENSATION = 0.62  # viser's default lights brighten a lit shape about threefold
 _CLEARANCE_M = 0.04  # lifts lines and arrows off the plane they would otherwise flicker against
 
 # Okabe and Ito's colours that stand out from viridis: distinguishable with every common colour vision.
@@ -201,10 +202,12 @@ def draw_surface(scene: SceneApi, name: str, picture: Surface, visible: bool = T
 
 
 def draw_arrows(scene: SceneApi, name: str, arrows: Arrows, scale: ColourScale, visible: bool = True) -> ArrowsHandle:
-    """Put arrows into the scene, coloured by |B|; thick enough for their spacing."""
+    """Put arrows into the scene in the colour of |B|, lightened so that they stand off a surface of that colour."""
     thickness = arrows.spacing_m
+    tint = 0.55 * scale.rgb(arrows.magnitude_uT) + 0.45 * 255.0
+    dimmed = (_LIGHT_COMPENSATION * tint).astype(np.uint8)
     return scene.add_arrows(
-        name, arrows.ends_m, scale.rgb(arrows.magnitude_uT), shaft_radius=0.04 * thickness,
+        name, arrows.ends_m, dimmed, shaft_radius=0.04 * thickness,
         head_radius=0.12 * thickness, head_length=0.35 * thickness, visible=visible,
     )  # fmt: skip
 

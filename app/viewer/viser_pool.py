@@ -89,6 +89,13 @@ class ViserPool:
             viewer.visitors -= 1
             viewer.idle_since = self._clock()
 
+    async def discard(self, organisation_id: str, viewer: OrganisationViewer) -> None:
+        """Stop a server that no longer answers; the next visit starts another."""
+        async with self._lock:
+            if self._viewers.get(organisation_id) is viewer:
+                del self._viewers[organisation_id]
+                await run_in_threadpool(stop_viser, viewer.server)
+
     async def stop_idle(self) -> None:
         """Stop every server that nobody has looked at for `idle_seconds`."""
         async with self._lock:

@@ -6,6 +6,7 @@ viser is imported here, inside the function, so that a web process which shows n
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -22,6 +23,9 @@ _one_at_a_time = threading.Lock()
 def start_viser() -> ViserServer:
     """A viser server on 127.0.0.1 at an ephemeral port, which refuses to open a public tunnel. Blocks for a moment."""
     import viser
+
+    # Said whenever a browser leaves while its scene is being drawn, which is nobody's fault.
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
 
     class LoopbackServer(viser.ViserServer):
         """viser lets any connected client ask for a public share address; this one has none to give."""

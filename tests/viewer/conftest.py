@@ -1,14 +1,30 @@
 """A small building for the viewer's tests: an analytic field, three floors, two organisations."""
 
-from collections.abc import Callable
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from typing import Any, ClassVar
 
+import httpx
+import msgspec
 import numpy as np
 import pytest
+import uvicorn
+import zstandard
+from starlette.applications import Starlette
+from starlette.routing import Mount
+from websockets.sync.client import ClientConnection as Connection
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from app.errors import NotFound
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components
+from app.viewer.page import COOKIE, ViewerApp
 from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
 
 
@@ -116,3 +132,162 @@ def source() -> MemorySource:
         {"map-0": make_grid(), "map-1": make_grid(height_m=5.2, seed=2), "map-s": make_grid("level", seed=3)},
         {"floor-0": [make_walk("lobby"), make_walk("hall", offset_m=2.0)], "floor-1": [make_walk("upstairs", 5.2)]},
     )
+
+
+@dataclass(frozen=True)
+class Who:
+    """An identity as the composition root would give it."""
+
+    organisation_id: str
+    scopes: frozenset[str]
+
+
+@dataclass
+class KeyRing:
+    """Keys to identities; a key can be revoked."""
+
+    keys: dict[str, Who]
+
+    def __call__(self, key: str) -> Who | None:
+        return self.keys.get(key)
+
+
+@pytest.fixture
+def keys() -> KeyRing:
+    return KeyRing(
+        {
+            "north-key": Who("north", frozenset({"map:read"})),
+            "south-key": Who("south", frozenset({"admin"})),
+            "locate-key": Who("north", frozenset({"locate"})),
+        }
+    )
+
+
+@dataclass
+class RunningViewer:
+    """A viewer served for real on loopback, and how to talk to it as a browser would."""
+
+    host: str
+    viewer: ViewerApp
+
+    @property
+    def url(self) -> str:
+        return f"http://{self.host}"
+
+    def client(self) -> httpx.Client:
+        return httpx.Client(base_url=self.url, headers={"Origin": self.url}, trust_env=False)
+
+    def cookie(self, key: str) -> str:
+        """Sign in and return the cookie header."""
+        with self.client() as client:
+            answer = client.post("/view/session", data={"key": key})
+            assert answer.status_code == 303, answer.text
+            return f"{COOKIE}={answer.cookies[COOKIE]}"
+
+    def websocket(self, cookie: str | None, path: str = "/view/buildings", origin: str | None = "") -> Connection:
+        """A WebSocket as viser's client opens it; `origin` "" is the server's own."""
+        return connect(
+            f"ws://{self.host}{path}",
+            origin=Origin(self.url) if origin == "" else (Origin(origin) if origin else None),
+            additional_headers={"Cookie": cookie} if cookie else {},
+            subprotocols=[Subprotocol(f"viser-v{version('viser')}")],
+            compression=None,
+            max_size=None,
+            proxy=None,
+        )
+
+
+class Page:
+    """viser's client, in so far as the tests need one: tells its camera, decodes what it is sent."""
+
+    CAMERA: ClassVar[dict[str, Any]] = {
+        "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [1.0, 1.0, 1.0], "fov": 1.0,
+        "image_height": 720, "image_width": 1280, "near": 0.01, "far": 1000.0, "look_at": [0.0, 0.0, 0.0],
+        "up_direction": [0.0, 0.0, 1.0],
+    }  # fmt: skip
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self.messages: list[dict[str, Any]] = []
+
+    def send(self, message: dict[str, Any]) -> None:
+        self.connection.send(msgspec.msgpack.encode(message))
+
+    def read_until(self, seen: Callable[["Page"], bool], seconds: float = 15.0) -> None:
+        """Read frames until `seen` says so; fails when it does not within the time."""
+        end = time.monotonic() + seconds
+        while not seen(self):
+            self._read(end - time.monotonic())
+
+    def read_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        with contextlib.suppress(TimeoutError):
+            while True:
+                self._read(max(0.0, end - time.monotonic()))
+
+    def _read(self, seconds: float) -> None:
+        frame = self.connection.recv(timeout=seconds)
+        assert isinstance(frame, bytes)
+        length = int.from_bytes(frame[8:16], "little")
+        inner = zstandard.ZstdDecompressor().decompress(
+            frame[16 : 16 + length], max_output_size=int.from_bytes(frame[:8], "little")
+        )
+        self.messages += msgspec.msgpack.decode(inner)["messages"]
+
+    def of_type(self, kind: str) -> list[dict[str, Any]]:
+        return [m for m in self.messages if m["type"] == kind]
+
+    def labels(self) -> list[str]:
+        return [m["props"]["text"] for m in self.of_type("LabelMessage")]
+
+    def control(self, label: str) -> dict[str, Any]:
+        return next(m for m in reversed(self.messages) if m.get("props", {}).get("label") == label)
+
+    def choose(self, label: str, value: object) -> None:
+        self.send({"type": "GuiUpdateMessage", "uuid": self.control(label)["uuid"], "updates": {"value": value}})
+
+
+@pytest.fixture
+def open_page() -> Callable[[Connection], Page]:
+    """Say hello as viser's client does, and give the page."""
+
+    def open_(connection: Connection) -> Page:
+        page = Page(connection)
+        page.send(Page.CAMERA)
+        return page
+
+    return open_
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[ViewerApp], RunningViewer]]:
+    """Serve viewers with uvicorn at ephemeral ports of 127.0.0.1 until the test ends."""
+    running: list[tuple[uvicorn.Server, threading.Thread]] = []
+
+    def serve_(viewer: ViewerApp) -> RunningViewer:
+        @contextlib.asynccontextmanager
+        async def lifespan(_: Starlette) -> AsyncIterator[None]:
+            yield
+            await viewer.close()
+
+        app = Starlette(routes=[Mount("/view", viewer)], lifespan=lifespan)
+        listener = socket.create_server(("127.0.0.1", 0))
+        server = uvicorn.Server(uvicorn.Config(app, log_level="warning", ws="websockets-sansio", lifespan="on"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        while not server.started:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        running.append((server, thread))
+        return RunningViewer(f"127.0.0.1:{listener.getsockname()[1]}", viewer)
+
+    yield serve_
+    for server, thread in running:
+        server.should_exit = True
+        thread.join(timeout=20)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def running(serve: Callable[[ViewerApp], RunningViewer], keys: KeyRing, source: MemorySource) -> RunningViewer:
+    return serve(ViewerApp(keys, source))

@@ -1,0 +1,99 @@
+"""The page in a real browser: somebody signs in and sees a field; a static page opens without any network."""
+
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from playwright.sync_api import Browser, sync_playwright
+
+from app.viewer.static_view import static_view_html
+
+CHROMIUM = Path("/usr/bin/chromium")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM.exists() and "CI" not in os.environ, reason=f"no browser at {CHROMIUM}"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    arguments = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+                 "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
+                 "--enable-unsafe-swiftshader"]  # fmt: skip
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser
+        browser.close()
+
+
+def new_page(browser: Browser):
+    page = browser.new_page(viewport={"width": 800, "height": 450})
+    page.faults = []
+    page.on("pageerror", lambda error: page.faults.append(str(error)))
+    return page
+
+
+def colourful_share(page) -> float:
+    """The share of the canvas that is neither background nor grey: how much field is to be seen."""
+    rgb = imread(io.BytesIO(page.locator("canvas").first.screenshot()))[..., :3]
+    return float((np.ptp(rgb, axis=-1) > 0.2).mean())
+
+
+def wait_for_field(page) -> None:
+    for _ in range(60):
+        if page.locator("canvas").count() and colourful_share(page) > 0.03:
+            return
+        page.wait_for_timeout(500)
+    pytest.fail(f"no field was drawn; the page reported {page.faults}")
+
+
+def test_somebody_signs_in_and_sees_a_field(running, browser):
+    page = new_page(browser)
+    page.goto(f"{running.url}/view/?building=tower&floor=floor-0")
+    page.get_by_label("API key").fill("wrong")
+    page.get_by_role("button", name="Sign in").click()
+    assert page.get_by_role("alert").is_visible()
+    page.get_by_label("API key").fill("north-key")
+    page.get_by_role("button", name="Sign in").click()
+    wait_for_field(page)
+    assert page.title() == "Isodyn"
+    assert page.get_by_label("Magnitude |B|, µT").is_visible()
+    assert page.get_by_text("213 m² measured, 2 walks").is_visible()
+    assert page.evaluate("document.cookie") == ""
+    page.get_by_role("button", name="Sign out").click()
+    page.get_by_label("API key").wait_for()
+    assert page.faults == []
+    page.close()
+
+
+def test_the_client_connects_to_no_other_server(running, browser):
+    """viser's client would take the address of any server from its own URL; the page's policy forbids it."""
+    page = new_page(browser)
+    name, _, value = running.cookie("north-key").partition("=")
+    page.context.add_cookies([{"name": name, "value": value, "url": f"{running.url}/view"}])
+    page.goto(f"{running.url}/view/buildings")
+    refused = page.evaluate(
+        """new Promise((tell) => {
+          document.addEventListener("securitypolicyviolation", (event) => tell(event.effectiveDirective));
+          new WebSocket("ws://127.0.0.1:9/");
+        })"""
+    )
+    assert refused == "connect-src"
+    page.close()
+
+
+def test_the_static_page_opens_without_any_network(browser, grid_of, walk_of, tmp_path):
+    file = tmp_path / "view.html"
+    file.write_text(static_view_html(grid_of(), [walk_of("a")], "Tower"), encoding="utf-8")
+    page = new_page(browser)
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(file.as_uri())
+    wait_for_field(page)
+    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
+    assert page.get_by_text("Magnitude |B|, µT").is_visible()
+    assert page.faults == []
+    page.close()

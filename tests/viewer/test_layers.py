@@ -1,0 +1,71 @@
+"""Layers as numbers, colours and legends."""
+
+import numpy as np
+import pytest
+
+from app.errors import InvalidInput
+from app.field.samples import COMPONENT_NAMES
+from app.viewer.layers import LAYERS, ColourScale, colour_scale, layer_names, layer_values, legend_html
+
+
+@pytest.mark.parametrize("components", ["vector", "level", "norm"])
+def test_every_layer_of_a_map_leaves_unmeasured_cells_out(grid_of, components):
+    grid = grid_of(components, heights=2)
+    names = layer_names(components)
+    assert set(COMPONENT_NAMES[components]) < set(names)
+    assert set(names) <= set(LAYERS)
+    for layer in names:
+        values = layer_values(grid, layer, 1)
+        assert values.shape == grid.measured.shape[1:]
+        if layer != "measured":
+            np.testing.assert_array_equal(np.isfinite(values), grid.measured[1])
+
+
+def test_norm_agrees_across_components(grid_of):
+    vector, level, norm = (layer_values(grid_of(c), "norm") for c in ("vector", "level", "norm"))
+    np.testing.assert_allclose(level, vector, rtol=1e-5)
+    np.testing.assert_allclose(norm, vector, rtol=1e-5)
+
+
+def test_components_sd_and_gradient_are_the_grids_own(grid_of):
+    grid = grid_of("vector")
+    j, i = np.argwhere(grid.measured[0])[123]
+    assert layer_values(grid, "by")[j, i] == grid.mean_uT[0, j, i, 1]
+    assert layer_values(grid, "sd")[j, i] == pytest.approx(np.sqrt(3.0) * grid.sd_uT[0, j, i, 0], rel=1e-6)
+    assert layer_values(grid, "gradient")[j, i] == pytest.approx(np.linalg.norm(grid.gradient_uT_per_m[0, j, i]))
+    np.testing.assert_array_equal(layer_values(grid, "measured"), grid.measured[0])
+
+
+def test_an_unknown_layer_or_height_is_refused_with_what_there_is(grid_of):
+    with pytest.raises(InvalidInput, match="level map has no layer 'bx'; ask for one of norm, horizontal, vertical"):
+        layer_values(grid_of("level"), "bx")
+    with pytest.raises(InvalidInput, match=r"0: 1\.20 m, 1: 1\.70 m"):
+        layer_values(grid_of(heights=2), "norm", 2)
+
+
+def test_scales_cover_the_values_of_every_floor_and_survive_none_and_one():
+    scale = colour_scale("norm", [np.linspace(10.0, 20.0, 1001), np.array([np.nan, 30.0] * 500)])
+    assert 10.0 <= scale.low < 11.0
+    assert scale.high == 30.0
+    for values in ([], [np.full(5, np.nan)], [np.full(5, 7.0)]):
+        scale = colour_scale("norm", values)
+        assert scale.high > scale.low
+
+
+def test_colours_are_monotone_in_lightness():
+    """So that the picture can be read without telling hues apart."""
+    for name in ("viridis", "cividis"):
+        rgb = ColourScale(0.0, 1.0, name).rgb(np.linspace(0.0, 1.0, 64)) / 255.0
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        luminance = linear @ [0.2126, 0.7152, 0.0722]
+        assert (np.diff(luminance) > -2e-3).all()
+    np.testing.assert_array_equal(
+        ColourScale(2.0, 4.0).rgb(np.array([-9.0, 9.0, np.nan])), ColourScale(2.0, 4.0).rgb(np.array([2.0, 4.0, 2.0]))
+    )
+
+
+def test_a_legend_says_name_unit_and_range_in_words():
+    html = legend_html("gradient", ColourScale(0.25, 12.0))
+    assert 'aria-label="Gradient along the floor, µT/m: from 0.2 to 12.0"' in html
+    assert html.count("<span>") == 5
+    assert "linear-gradient" in html

@@ -1,0 +1,147 @@
+"""Signing in, and the page behind it, on a real server at a real port."""
+
+import socket
+import sys
+from pathlib import Path
+from subprocess import run
+
+import pytest
+
+from app.viewer.page import COOKIE, ViewerApp
+
+
+def test_a_stranger_is_shown_the_sign_in_page_and_nothing_else(running):
+    with running.client() as client:
+        answer = client.get("/view/?building=tower&floor=floor-0")
+        assert answer.status_code == 200
+        assert 'type="password"' in answer.text
+        assert 'value="tower"' in answer.text
+        assert 'value="floor-0"' in answer.text
+        assert "http://" not in answer.text
+        assert "https://" not in answer.text
+        assert "<script" not in answer.text
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["cache-control"] == "no-store"
+        assert client.get("/view/session").status_code == 401
+        assert "Sign in" in client.get("/view/buildings/tower").text
+    assert running.viewer.pool.running() == {}
+
+
+def test_what_a_link_asks_for_is_escaped(running):
+    with running.client() as client:
+        assert "<b>" not in client.get("/view/", params={"building": '"><b>'}).text
+
+
+@pytest.mark.parametrize("key", ["", "no-such-key", "locate-key"])
+def test_a_wrong_or_too_small_key_signs_nobody_in(running, key):
+    with running.client() as client:
+        answer = client.post("/view/session", data={"key": key})
+        assert answer.status_code == 401
+        assert "set-cookie" not in answer.headers
+        assert 'role="alert"' in answer.text
+    assert len(running.viewer.signed_in) == 0
+
+
+def test_the_cookie_is_random_and_kept_from_scripts_and_other_sites(running):
+    with running.client() as client:
+        answer = client.post("/view/session", data={"key": "north-key", "building": "tower"})
+        assert answer.status_code == 303
+        assert answer.headers["location"] == "/view/buildings/tower"
+        header = answer.headers["set-cookie"].lower()
+        assert all(flag in header for flag in ("httponly", "samesite=strict", "path=/view", "max-age=28800"))
+        assert "north-key" not in header
+        assert answer.cookies[COOKIE] != running.cookie("north-key").partition("=")[2]
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", None])
+def test_only_our_own_form_signs_in_or_out(running, origin):
+    headers = {"Origin": origin} if origin else {}
+    with running.client() as client:
+        del client.headers["origin"]
+        for path in ("/view/session", "/view/sign-out"):
+            assert client.post(path, data={"key": "north-key"}, headers=headers).status_code == 403
+    assert len(running.viewer.signed_in) == 0
+
+
+def test_a_huge_form_is_refused(running):
+    with running.client() as client:
+        assert client.post("/view/session", data={"key": "x" * 10_000}).status_code == 413
+
+
+def test_the_page_is_visers_client_with_our_policy(running):
+    cookie = {"Cookie": running.cookie("north-key")}
+    with running.client() as client:
+        moved = client.get("/view/?building=tower&floor=floor-0&websocket=wss://evil.example", headers=cookie)
+        assert moved.headers["location"] == "/view/buildings/tower/floors/floor-0"  # the foreign address is gone
+        assert client.get("/view/", headers=cookie).headers["location"] == "/view/buildings"
+        page = client.get("/view/buildings/tower/floors/floor-0", headers=cookie)
+        assert page.status_code == 200
+        assert "<title>Isodyn</title>" in page.text
+        assert '<div id="root"></div>' in page.text
+        assert 'action="/view/sign-out"' in page.text
+        assert "connect-src 'self'" in page.headers["content-security-policy"]
+        assert "set-cookie" not in page.headers
+        again = client.get("/view/buildings", headers={**cookie, "If-None-Match": page.headers["etag"]})
+        assert again.status_code == 304
+        plain = client.get("/view/buildings", headers={**cookie, "Accept-Encoding": "identity"})
+        assert plain.content == page.content
+        assert client.get("/view/session", headers=cookie).status_code == 204
+
+
+def test_signing_out_makes_the_cookie_worthless(running):
+    cookie = {"Cookie": running.cookie("north-key")}
+    with running.client() as client:
+        assert client.post("/view/sign-out", headers=cookie).headers["location"] == "/view/"
+        assert client.get("/view/session", headers=cookie).status_code == 401
+
+
+def test_a_session_expires_and_a_revoked_key_loses_the_page(serve, keys, source):
+    now = [0.0]
+    running = serve(ViewerApp(keys, source, session_seconds=1000.0, clock=lambda: now[0]))
+    cookie = {"Cookie": running.cookie("north-key")}
+    with running.client() as client:
+        now[0] = 999.0
+        assert client.get("/view/session", headers=cookie).status_code == 204
+        now[0] = 1000.0
+        assert client.get("/view/session", headers=cookie).status_code == 401
+        assert len(running.viewer.signed_in) == 0
+        cookie = {"Cookie": running.cookie("north-key")}
+        del keys.keys["north-key"]
+        now[0] += 61.0
+        assert client.get("/view/session", headers=cookie).status_code == 401
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs Linux's table of sockets")
+def test_viser_listens_on_loopback_only(running):
+    with running.client() as client:
+        client.get("/view/buildings", headers={"Cookie": running.cookie("north-key")})
+    (viewer,) = running.viewer.pool.running().values()
+    port = viewer.server.get_port()
+    tables = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+    listening = [line.split() for table in tables for line in table.read_text().splitlines()[1:]]
+    addresses = {f[1].split(":")[0] for f in listening if f[3] == "0A" and int(f[1].split(":")[1], 16) == port}
+    assert addresses == {"0100007F"}
+    with socket.create_connection(("127.0.0.1", port), timeout=5):
+        pass
+
+
+def test_a_servers_life_ends_when_nobody_has_looked_for_a_while(serve, keys, source):
+    running = serve(ViewerApp(keys, source, idle_seconds=0.2))
+    with running.client() as client:
+        client.get("/view/buildings", headers={"Cookie": running.cookie("north-key")})
+    (viewer,) = running.viewer.pool.running().values()
+    thread = viewer.server._websock_server._server_thread
+    thread.join(timeout=10)
+    assert not thread.is_alive()
+    with running.client() as client:  # and begins again with the next visitor
+        assert client.get("/view/buildings", headers={"Cookie": running.cookie("north-key")}).status_code == 200
+
+
+def test_viser_and_matplotlib_are_loaded_by_the_first_visit_only():
+    code = (
+        "import sys, app.viewer.page, app.viewer.heatmap; print({'viser', 'matplotlib', 'sklearn'} & set(sys.modules))"
+    )
+    assert run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
