@@ -22,6 +22,7 @@ Blocks = NDArray[np.int32]
 CAPACITY = 400_000  # poses kept at most
 _BLOCKS_PER_POSE = 5  # how many blocks of a level may be followed, per pose of the capacity
 _BEAM = 48
+_DIVE_AGAIN = 1500  # blocks of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _SPARE_NATS = 12.0  # tempered: how far beyond the limit a bound is followed, so that the missed mass comes out small
 
@@ -170,17 +171,20 @@ class _Sweep:
 
     def run(self, on_plane: _PlaneCosts, start: "_Start") -> tuple[Blocks, Array]:
         """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
-        blocks, bounds = start.blocks, start.bounds
+        blocks, bounds, seed, seed_cost = start.blocks, start.bounds, start.seed, start.seed_cost
         if self._stop() > start.followed_to:
             again = bounds <= self._stop()
             bounds[again] = on_plane.bounds(blocks[again], TOP_LEVEL, self._stop())
         for level in range(TOP_LEVEL, 0, -1):
             if level < TOP_LEVEL:
                 bounds = on_plane.bounds(blocks, level, self._stop())
+            if level < TOP_LEVEL and len(blocks) > _DIVE_AGAIN:
+                pose, cost = _dive(on_plane, blocks, bounds, level)
+                seed, seed_cost = (pose, cost) if cost < seed_cost else (seed, seed_cost)
+                self._improve(cost)
             keep = self._keep(bounds, _BLOCKS_PER_POSE * self.capacity)
             self.miss(on_plane, blocks, bounds, ~keep, level)
             blocks = on_plane.split(blocks[keep], level)
-        seed, seed_cost = start.seed, start.seed_cost
         seeded = np.flatnonzero((blocks == seed).all(axis=1))
         blocks = np.concatenate([seed, np.delete(blocks, seeded, axis=0)])
         costs = on_plane.costs(blocks, self._stop())
@@ -243,14 +247,20 @@ def _start(on_plane: _PlaneCosts, expected: float) -> _Start:
     """Bound the top blocks as far as a matching window needs it, and follow the most promising down to a pose."""
     top = on_plane.top_blocks()
     top_bounds = on_plane.bounds(top, TOP_LEVEL, expected)
-    blocks, bounds = top, top_bounds
-    for level in range(TOP_LEVEL, 0, -1):
+    seed, seed_cost = _dive(on_plane, top, top_bounds, TOP_LEVEL)
+    return _Start(top, top_bounds, expected, seed, seed_cost)
+
+
+def _dive(on_plane: _PlaneCosts, blocks: Blocks, bounds: Array, level: int) -> tuple[Blocks, float]:
+    """Follow the most promising blocks of a level down to a pose (1, 3) and its cost."""
+    while level > 0:
         if len(blocks) > _BEAM:
             blocks = blocks[np.argpartition(bounds, _BEAM)[:_BEAM]]
         blocks = on_plane.split(blocks, level)
-        bounds = on_plane.bounds(blocks, level - 1, np.inf) if level > 1 else on_plane.costs(blocks, np.inf)
+        level -= 1
+        bounds = on_plane.bounds(blocks, level, np.inf) if level else on_plane.costs(blocks, np.inf)
     best = int(np.argmin(bounds))
-    return _Start(top, top_bounds, expected, blocks[best : best + 1], float(bounds[best]))
+    return blocks[best : best + 1], float(bounds[best])
 
 
 def _prior_in_cells(plane: Plane, prior: PosePrior, temper: float) -> tuple[Array, float]:
