@@ -47,6 +47,7 @@ def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress) -> Result
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env={**os.environ, **ONE_THREAD},
+        start_new_session=True,  # a Ctrl-C is for the worker, which decides what becomes of its fits
     )
     try:
         _tell(child, json.dumps({"builder": builder, "plan": plan, "blob_url": blob_url}))
@@ -133,6 +134,7 @@ def main() -> None:
     """The child."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not look like an answer
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as is a service manager's, sent to all at once
     os.nice(5)  # whoever asks for a position comes first
     order = json.loads(sys.stdin.readline())
     cancelled = threading.Event()

@@ -21,7 +21,14 @@ TIMEOUT_S = 60.0
 def hand_over(database_url: str, dead_id: str) -> None:
     """Run a janitor under the dead worker's id. Raises subprocess.SubprocessError when it could not finish."""
     order = json.dumps({"database_url": database_url, "dead_id": dead_id})  # not in the arguments: it holds a password
-    subprocess.run([sys.executable, "-m", "workers.janitor"], input=order, text=True, check=True, timeout=TIMEOUT_S)
+    subprocess.run(
+        [sys.executable, "-m", "workers.janitor"],
+        input=order,
+        text=True,
+        check=True,
+        timeout=TIMEOUT_S,
+        start_new_session=True,
+    )
 
 
 def main() -> None:

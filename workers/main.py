@@ -9,7 +9,6 @@ import logging
 import os
 import signal
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -19,7 +18,6 @@ from uuid import uuid4
 
 from dbos import DBOS, DBOSClient
 from sqlalchemy import Engine
-from sqlalchemy.exc import SQLAlchemyError
 
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.engine import QUEUE, engine_configuration, open_client
@@ -33,6 +31,7 @@ from workers.workflows import WorkflowContext, register_workflows
 __all__ = ["run_worker"]
 
 POLL_S = 0.25
+LOOK_FOR_DEAD_S = 5.0
 FENCED = 3
 
 log = logging.getLogger(__name__)
@@ -109,9 +108,9 @@ def _reap_until(stop: threading.Event, url: str, lease: Lease, client: DBOSClien
                     hand_over(url, dead_id)
                 lease.bury(dead_id)
             close_abandoned_jobs(client, context)
-        except (SQLAlchemyError, subprocess.SubprocessError):
+        except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied
             log.exception("could not look after dead workers; trying again")
-        if stop.wait(lease.ttl_s / 2):
+        if stop.wait(min(lease.ttl_s / 4, LOOK_FOR_DEAD_S)):
             return
 
 

@@ -30,9 +30,8 @@ def has_unfinished_jobs(client: DBOSClient, worker_id: str) -> bool:
 def close_abandoned_jobs(client: DBOSClient, context: WorkflowContext) -> None:
     """Give a last state to jobs that look open although the engine will never touch them again."""
     with context.sessions() as session:
-        open_jobs = dict(
-            session.execute(select(Job.workflow_id, Job.id).where(Job.status.not_in(FINAL_STATES))).tuples()
-        )
+        rows = session.execute(select(Job.workflow_id, Job.id).where(Job.status.not_in(FINAL_STATES)))
+        open_jobs = {row.workflow_id: row.id for row in rows}
     if not open_jobs:
         return
     abandoned = client.list_workflows(

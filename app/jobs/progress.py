@@ -1,15 +1,19 @@
 """How a running job shows where it is, and learns that it should stop."""
 
+import logging
 import time
 from collections.abc import Callable
 
 from sqlalchemy import update
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Job
 from app.errors import JobCancelled
 
 __all__ = ["JobReporter"]
+
+log = logging.getLogger(__name__)
 
 
 class JobReporter:
@@ -39,8 +43,12 @@ class JobReporter:
             .values(progress=progress, message=message)
             .returning(Job.cancel_requested)
         )
-        with self._sessions.begin() as session:
-            cancelled = session.scalar(statement)
+        try:
+            with self._sessions.begin() as session:
+                cancelled = session.scalar(statement)
+        except DBAPIError:  # hours of work must not end because a report could not be written
+            log.warning("progress of job %s could not be written", self._job_id, exc_info=True)
+            cancelled = False
         if cancelled is not False:
             raise JobCancelled("the job was asked to stop")
         self._next_s = time.monotonic() + self._interval_s

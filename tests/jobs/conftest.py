@@ -36,8 +36,8 @@ def queue(engine: Engine) -> Iterator[JobQueue]:
 class Site:
     """Makes floors whose builds do as told (see fake_builder), uploads to them, and waits for what comes of it."""
 
-    def __init__(self, sessions: sessionmaker[Session], queue: JobQueue) -> None:
-        self.sessions, self.queue = sessions, queue
+    def __init__(self, engine: Engine, sessions: sessionmaker[Session], queue: JobQueue) -> None:
+        self.engine, self.sessions, self.queue = engine, sessions, queue
 
     def floor(self, **orders: object) -> Floor:
         with self.sessions.begin() as session:
@@ -90,8 +90,8 @@ class Site:
 
 
 @pytest.fixture(scope="module")
-def site(sessions: sessionmaker[Session], queue: JobQueue) -> Site:
-    return Site(sessions, queue)
+def site(engine: Engine, sessions: sessionmaker[Session], queue: JobQueue) -> Site:
+    return Site(engine, sessions, queue)
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ class Crew:
         self._diary = folder / "diary"
         self._diary.touch()
         self._log = folder / "log"
-        self._environment = {
+        self.environment = {
             **os.environ,
             "ISODYN_DATABASE_URL": database_url,
             "ISODYN_DATA_DIR": str(folder),
@@ -116,10 +116,13 @@ class Crew:
         }
         self._processes: list[subprocess.Popen[bytes]] = []
 
+    @staticmethod
+    def command(**options: object) -> list[str]:
+        return [sys.executable, "-c", START, json.dumps({"lease_ttl_s": 3.0, **options})]
+
     def hire(self, **options: object) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-c", START, json.dumps({"lease_ttl_s": 3.0, **options})]
         with self._log.open("a") as log:
-            process = subprocess.Popen(command, env=self._environment, stderr=log)
+            process = subprocess.Popen(self.command(**options), env=self.environment, stderr=log)
         self._processes.append(process)
         return process
 

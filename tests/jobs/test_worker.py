@@ -12,6 +12,7 @@ from sqlalchemy import select
 
 from app.blobs import FolderBlobStore
 from app.db.tables import Floor, Job, Map, Survey
+from app.jobs.engine import open_client
 
 if TYPE_CHECKING:
     from conftest import Crew, Site
@@ -173,6 +174,21 @@ def test_a_floor_deleted_while_it_is_fitted_troubles_nobody(crew: "Crew", site: 
     assert site.wait(site.upload(after)[1]).status == "successful"
 
 
+def test_a_job_cancelled_in_the_engine_by_an_operator_does_not_stay_open(crew: "Crew", site: "Site") -> None:
+    floor = site.floor(sleep_s=1.0)
+    _, running = site.upload(floor)
+    site.wait_running(running)
+    _, waiting = site.upload(floor)
+    client = open_client(site.engine)
+    client.cancel_workflow(site.job(waiting).workflow_id)
+    client.destroy()
+    job = site.wait(waiting)
+    assert (job.status, job.message) == ("failed", "cancelled in the job engine by an operator")
+    assert site.wait(site.upload(floor)[1]).status == "successful"
+
+
 def test_the_workers_log_says_nothing_untoward(crew: "Crew") -> None:
     assert "locked" not in crew.log
     assert "onductor" not in crew.log
+    assert "Exception in thread" not in crew.log
+    assert "could not look after" not in crew.log
