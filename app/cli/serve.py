@@ -1,6 +1,7 @@
 """`isodyn serve`, `isodyn worker` and `isodyn openapi`."""
 
 import json
+import signal
 import subprocess
 import sys
 import threading
@@ -32,6 +33,8 @@ def serve(
     console = Console(stderr=True, highlight=False)
     if made is not None:
         console.print(f"[bold]Admin key (shown this once, keep it):[/bold] {made}", soft_wrap=True)
+    # uvicorn stops gracefully on SIGTERM and then raises it again: let that end here, past the worker's farewell.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     supervisor = WorkerSupervisor() if embedded_worker else None
     if supervisor is not None:
         supervisor.start()

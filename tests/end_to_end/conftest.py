@@ -38,9 +38,11 @@ class Server:
         )
 
     def start(self) -> None:
-        log = (self.folder / "server.log").open("ab")
         command = [sys.executable, "-m", "app.cli", "serve"]
-        self.process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log, start_new_session=True)
+        with (self.folder / "server.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                command, env=self.environment, stdout=log, stderr=log, start_new_session=True
+            )
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             assert self.process.poll() is None, (self.folder / "server.log").read_text()
