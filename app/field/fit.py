@@ -1,25 +1,26 @@
 """Samples in, map out: the one entry of the map engine."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from app.errors import InvalidInput
 from app.field.consistency import check_consistency
+from app.field.estimate import FieldEstimate
+from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
-from app.field.hilbert import posterior
-from app.field.hyperparameters import Hyperparameters
-from app.field.learning import learn_hyperparameters
-from app.field.leave_one_out import HeldOut, HeldOutPrediction, error_correlation_m, score
+from app.field.hilbert_engine import estimate_by_hilbert
+from app.field.leave_one_out import HeldOut, error_correlation_m, score
 from app.field.measured import measured_cells, near_other_walks
 from app.field.observations import Walk, observe
-from app.field.raster import BlendedField, GridFrame
 from app.field.samples import COMPONENT_NAMES, Samples
-from app.field.spec import FittedMap, MapSpec, Progress
-from app.field.statistics import TiledWalks, marginalise
+from app.field.spec import Engine, FittedMap, MapSpec, Progress
 from app.geometry import Array
 
 __all__ = ["fit_map"]
+
+_Estimator = Callable[[Sequence[Walk], Array, MapSpec, float | None, Progress], FieldEstimate]
+_ENGINES: dict[Engine, _Estimator] = {"hilbert": estimate_by_hilbert, "exact": estimate_by_exact}
 
 
 def _silent(fraction: float, message: str) -> None:
@@ -36,54 +37,19 @@ def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _s
     height_m = _single_height(spec)
     progress(0.0, "reading the walks")
     observed = observe(walks, spec.components)
-    return _fit_hilbert(observed, spec, height_m, progress)
-
-
-def _fit_hilbert(walks: Sequence[Walk], spec: MapSpec, height_m: float | None, progress: Progress) -> FittedMap:
-    """Learn on a few tiles, then one pass over all: posterior, grid cells and held-out predictions of each tile."""
-    ambient_uT = np.median(np.concatenate([walk.field_uT for walk in walks]), axis=0)
-    hyper, lattice = learn_hyperparameters(
-        walks, ambient_uT, spec.kernel, lambda f, message: progress(0.02 + 0.28 * f, message)
-    )
-    frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, height_m)
-    blended = BlendedField(lattice, frame, len(ambient_uT))
-    predicted = HeldOutPrediction(lattice, walks, hyper)
-    tiled = TiledWalks(lattice, walks, ambient_uT)
-    tiles = list(tiled.counts())
-    for index, tile in enumerate(tiles):
-        progress(0.3 + 0.65 * index / len(tiles), f"fitting tile {index + 1} of {len(tiles)}")
-        basis = lattice.basis(tile)
-        white_ratio = hyper.white_ratio_in(basis)
-        surveys = tiled.statistics(tile, hyper.walk_noise_in(basis))
-        evidence = {name: marginalise(s, white_ratio, hyper.bias_ratio) for name, s in surveys.items()}
-        total = sum(list(evidence.values())[1:], start=next(iter(evidence.values())))
-        blended.add(tile, posterior(basis, total, hyper))
-        predicted.add(tile, evidence, total)
-    progress(0.95, "scoring the map by leaving each survey out")
-    noise_sd_uT = _noise_sd_uT(walks, hyper)
-    held_out = _held_out(walks, predicted, hyper, ambient_uT, noise_sd_uT)
+    ambient_uT = np.median(np.concatenate([walk.field_uT for walk in observed]), axis=0)
+    estimate = _ENGINES[spec.engine](observed, ambient_uT, spec, height_m, lambda f, text: progress(0.9 * f, text))
+    progress(0.9, "scoring the map by leaving each survey out")
+    noise_sd_uT = _noise_sd_uT(observed, estimate.error_sd_uT)
+    held_out = _held_out(observed, estimate, ambient_uT, noise_sd_uT)
     correlation_m = error_correlation_m(held_out)
-    grid = FieldGrid(
-        components=spec.components,
-        origin_m=(float(frame.x_m[0]), float(frame.y_m[0])),
-        resolution_m=spec.resolution_m,
-        heights_m=np.array([frame.height_m]),
-        mean_uT=(blended.mean_uT.transpose(1, 2, 0) + ambient_uT).astype(np.float32)[None],
-        sd_uT=(np.sqrt(blended.variance_ratio)[..., None] * hyper.signal_sd_uT).astype(np.float32)[None],
-        gradient_uT_per_m=np.ascontiguousarray(blended.gradient_uT_per_m.transpose(2, 3, 1, 0))[None],
-        measured=measured_cells(frame, walks, spec.resolution_m, blended.variance_ratio)[None],
-        ambient_uT=ambient_uT,
-        prior_sd_uT=hyper.signal_sd_uT,
-        noise_sd_uT=noise_sd_uT,
-        error_correlation_m=correlation_m,
-    )
-    names = COMPONENT_NAMES[spec.components]
     scored = score(held_out)
+    names = COMPONENT_NAMES[spec.components]
     return FittedMap(
-        grid=grid,
-        hyperparameters=hyper.as_json() | {"engine": "hilbert", "tile_pitch_m": lattice.pitch_m},
+        grid=_grid(observed, estimate, spec, ambient_uT, noise_sd_uT, correlation_m),
+        hyperparameters={"engine": spec.engine} | estimate.hyperparameters,
         score=scored,
-        score_reason=None if scored else _score_reason(walks),
+        score_reason=None if scored else _score_reason(observed),
         consistency={name: check_consistency(h, names, correlation_m) for name, h in held_out.items()},
     )
 
@@ -102,32 +68,56 @@ def _single_height(spec: MapSpec) -> float | None:
     return spec.heights_m[0]
 
 
-def _noise_sd_uT(walks: Sequence[Walk], hyper: Hyperparameters) -> Array:
+def _noise_sd_uT(walks: Sequence[Walk], error_sd_uT: Array) -> Array:
     """(c,) sd of one further sample about the field: error of an observation, and scatter of samples about it."""
     scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
-    return np.asarray(np.sqrt(np.square(hyper.error_sd_uT) + scatter_uT2))
+    return np.asarray(np.sqrt(np.square(error_sd_uT) + scatter_uT2))
 
 
 def _held_out(
-    walks: Sequence[Walk],
-    predicted: HeldOutPrediction,
-    hyper: Hyperparameters,
-    ambient_uT: Array,
-    noise_sd_uT: Array,
+    walks: Sequence[Walk], estimate: FieldEstimate, ambient_uT: Array, noise_sd_uT: Array
 ) -> dict[str, HeldOut]:
     near = near_other_walks(walks)
     held_out: dict[str, HeldOut] = {}
     for walk in walks:
-        name = walk.survey_id
-        stretch = walk.stretch_of_sample
-        variance_uT2 = np.multiply.outer(predicted.variance_ratio[name][stretch], np.square(hyper.signal_sd_uT))
+        name, stretch = walk.survey_id, walk.stretch_of_sample
+        predicted_uT = ambient_uT + estimate.held_out_mean_uT[name]
+        latent_uT2 = estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT)
         held_out[name] = HeldOut(
-            error_uT=walk.sample_field_uT - ambient_uT - predicted.mean_uT[name][stretch],
-            sd_uT=np.sqrt(variance_uT2 + np.square(noise_sd_uT)),
+            error_uT=walk.sample_field_uT - predicted_uT[stretch],
+            sd_uT=np.sqrt(latent_uT2 + np.square(noise_sd_uT))[stretch],
             judged=near[name],
             path_m=walk.path_m[stretch],
         )
     return held_out
+
+
+def _grid(
+    walks: Sequence[Walk],
+    estimate: FieldEstimate,
+    spec: MapSpec,
+    ambient_uT: Array,
+    noise_sd_uT: Array,
+    correlation_m: float,
+) -> FieldGrid:
+    """One layer of cells, cells first and components last."""
+    frame = estimate.frame
+    sd_uT = np.sqrt(estimate.variance_ratio.transpose(1, 2, 0)) * estimate.prior_sd_uT
+    measured = measured_cells(frame, walks, spec.resolution_m, estimate.variance_ratio.mean(axis=0))
+    return FieldGrid(
+        components=spec.components,
+        origin_m=(float(frame.x_m[0]), float(frame.y_m[0])),
+        resolution_m=spec.resolution_m,
+        heights_m=np.array([frame.height_m]),
+        mean_uT=(estimate.mean_uT.transpose(1, 2, 0) + ambient_uT).astype(np.float32)[None],
+        sd_uT=sd_uT.astype(np.float32)[None],
+        gradient_uT_per_m=np.ascontiguousarray(estimate.gradient_uT_per_m.transpose(2, 3, 1, 0), np.float32)[None],
+        measured=measured[None],
+        ambient_uT=ambient_uT,
+        prior_sd_uT=estimate.prior_sd_uT,
+        noise_sd_uT=noise_sd_uT,
+        error_correlation_m=correlation_m,
+    )
 
 
 def _score_reason(walks: Sequence[Walk]) -> str:

@@ -1,6 +1,12 @@
-"""Learning the hyper-parameters of a map on a few of its tiles."""
+"""Learning the hyper-parameters of a map on a few of its tiles.
+
+First kernel length, white noise and survey offsets, on the lattice that suits the length they find; then the shape of
+the errors along a walk, by a compass search over its two parameters: each trial whitens the walks anew and learns the
+rest from the statistics, starting where the best trial so far ended.
+"""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +16,7 @@ from app.field.observations import Walk
 from app.field.spec import Kernel, Progress
 from app.field.statistics import TiledWalks
 from app.field.tiles import Lattice, Tile
-from app.field.walk_noise import WHITE
+from app.field.walk_noise import WHITE, WalkNoise
 from app.geometry import Array
 
 __all__ = ["learn_hyperparameters"]
@@ -21,30 +27,81 @@ ROUNDS = 6
 FINEST, COARSEST = 8.0, 1.5
 """A tile can tell lengths between an eighth of its pitch (its functions) and two thirds of it (its size)."""
 
+FAINT_WALK_NOISE = WalkNoise(variance_ratio=0.3, length_m=1.5)
+WORTH_NATS = 3.0
+"""Errors are taken to be correlated along a walk when that makes the data this much more likely."""
+MAX_TRIALS = 24
+COMPASS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+SMALLEST_STEP = np.log(1.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Learned:
+    """Where one search for length, white noise and offsets ended."""
+
+    hyper: Hyperparameters
+    log_parameters: Array
+    value: float
+
+
+class _Learner:
+    """A few well-walked tiles of one lattice, to learn on."""
+
+    def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel) -> None:
+        self._kernel = kernel
+        self._pin_bias = len(walks) == 1
+        self._length_bounds_m = (lattice.pitch_m / FINEST, lattice.pitch_m / COARSEST)
+        few = Lattice(lattice.pitch_m, functions_per_axis=LEARNING_FUNCTIONS)
+        self._tiled = TiledWalks(few, walks, ambient_uT)
+        self._chosen = _well_walked(self._tiled.counts())
+
+    def learn(self, noise: WalkNoise, start_log: Array) -> _Learned:
+        tiles = [
+            TileStatistics(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise))
+            for tile in self._chosen
+        ]
+        return _Learned(*learn(tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias))
+
 
 def learn_hyperparameters(
     walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel, progress: Progress
 ) -> tuple[Hyperparameters, Lattice]:
-    """Maximum marginal likelihood on a few well-walked tiles, on the lattice that suits the length it finds."""
-    log_parameters = START_LOG
+    """Maximum marginal likelihood, and the lattice that suits the length it finds."""
     lattice = Lattice.for_length(float(np.exp(START_LOG[0])))
+    start_log = START_LOG
     for turn in range(ROUNDS):
-        progress(turn / ROUNDS, "learning hyper-parameters")
-        few = Lattice(lattice.pitch_m, functions_per_axis=LEARNING_FUNCTIONS)
-        tiles = _tile_statistics(few, walks, ambient_uT)
-        reach_m = (lattice.pitch_m / FINEST, lattice.pitch_m / COARSEST)
-        hyper, log_parameters, _ = learn(tiles, kernel, WHITE, log_parameters, reach_m, pin_bias=len(walks) == 1)
-        suited = Lattice.for_length(hyper.length_m)
+        progress(0.5 * turn / ROUNDS, "learning length and noise")
+        learner = _Learner(lattice, walks, ambient_uT, kernel)
+        white = learner.learn(WHITE, start_log)
+        start_log = white.log_parameters
+        suited = Lattice.for_length(white.hyper.length_m)
         if suited == lattice:
             break
         lattice = suited
-    return hyper, lattice
+    hyper = _learn_walk_noise(learner, white, progress).hyper
+    return hyper, Lattice.for_length(hyper.length_m)
 
 
-def _tile_statistics(lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> list[TileStatistics]:
-    tiled = TiledWalks(lattice, walks, ambient_uT)
-    chosen = _well_walked(tiled.counts())
-    return [TileStatistics(lattice.basis(tile), tiled.statistics(tile, WHITE)) for tile in chosen]
+def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:
+    """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
+    best = learner.learn(FAINT_WALK_NOISE, white.log_parameters)
+    if best.value > white.value - WORTH_NATS:
+        return white
+    centre, step = np.log([FAINT_WALK_NOISE.variance_ratio, FAINT_WALK_NOISE.length_m]), np.log([4.0, 2.0])
+    direction, failures = 0, 0
+    for trial in range(MAX_TRIALS):
+        progress(0.5 + 0.5 * trial / MAX_TRIALS, "learning the errors along a walk")
+        point = centre + step * COMPASS[direction]
+        found = learner.learn(WalkNoise(*np.exp(point).tolist()), best.log_parameters)
+        if found.value < best.value:
+            best, centre, failures = found, point, 0
+            continue
+        direction, failures = (direction + 1) % len(COMPASS), failures + 1
+        if failures == len(COMPASS):
+            step, failures = step / 2.0, 0
+            if step[0] < SMALLEST_STEP:
+                break
+    return best
 
 
 def _well_walked(counts: Mapping[Tile, int]) -> list[Tile]:

@@ -16,8 +16,8 @@ __all__ = ["MAX_SD_OF_PRIOR", "REACH_M", "measured_cells", "near_other_walks"]
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
 
-MAX_SD_OF_PRIOR = 0.7
-"""A cell whose sd is above this share of the prior's has had less than half of its variance explained."""
+MAX_SD_OF_PRIOR = 0.9
+"""A cell whose sd is above this share of the prior's has had less than a fifth of its variance explained."""
 
 
 def measured_cells(

@@ -61,7 +61,7 @@ class BlendedField:
     def __init__(self, lattice: Lattice, frame: GridFrame, components: int) -> None:
         self._lattice, self._frame = lattice, frame
         self.mean_uT = np.zeros((components, *frame.shape))
-        self.gradient_uT_per_m = np.zeros((2, components, *frame.shape), dtype=np.float32)
+        self.gradient_uT_per_m = np.zeros((2, components, *frame.shape))
         self.variance_ratio = np.ones(frame.shape)
 
     def add(self, tile: Tile, fitted: TilePosterior) -> None:

@@ -6,7 +6,7 @@ survey's constant offset inside the tile, of prior variance `bias_ratio` beside 
 integrated out in closed form afterwards (Sherman-Morrison), so offsets cost nothing and no sample is read again.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WalkNoise, whiten
 from app.geometry import Array
 
-__all__ = ["Evidence", "SurveyStatistics", "TiledWalks", "marginalise", "survey_statistics"]
+__all__ = ["Evidence", "SurveyStatistics", "TiledWalks", "add_evidence", "marginalise", "survey_statistics"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,9 +42,6 @@ class Evidence:
 
     gram: Array
     target: Array
-
-    def __add__(self, other: "Evidence") -> "Evidence":
-        return Evidence(self.gram + other.gram, self.target + other.target)
 
     def __sub__(self, other: "Evidence") -> "Evidence":
         return Evidence(self.gram - other.gram, self.target - other.target)
@@ -101,6 +98,11 @@ class TiledWalks:
             points_m, path_m = walk.position_m[inside, :2], walk.path_m[inside]
             result[survey_id] = survey_statistics(basis, points_m, deviation_uT, path_m, noise)
         return result
+
+
+def add_evidence(evidence: Collection[Evidence]) -> Evidence:
+    """The evidence of a whole tile: the sum over its surveys."""
+    return Evidence(np.sum([e.gram for e in evidence], axis=0), np.sum([e.target for e in evidence], axis=0))
 
 
 def marginalise(survey: SurveyStatistics, white_ratio: float, bias_ratio: float) -> Evidence:

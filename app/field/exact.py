@@ -1,0 +1,170 @@
+"""The reference engine: exact Gaussian processes by scikit-learn, faithful to Kuevor's intermediate map (B7-B9).
+
+One independent process per component over positions in three dimensions, isotropic kernel and white noise, each with
+its own hyper-parameters by maximum marginal likelihood (Kuevor, L423-L451, L564-L568); about an ambient constant in
+place of a zero mean. Costs grow with the cube of the observations, so their number is capped.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.spatial.distance import cdist
+
+from app.errors import InvalidInput
+from app.field.estimate import FieldEstimate
+from app.field.kernels import MATERN_SMOOTHNESS, covariance, covariance_slope
+from app.field.observations import Walk
+from app.field.raster import GridFrame
+from app.field.spec import Kernel, MapSpec, Progress
+from app.geometry import Array
+
+__all__ = ["MAX_OBSERVATIONS", "ExactProcess", "estimate_by_exact", "learn_exact"]
+
+MAX_OBSERVATIONS = 2000
+CELLS_AT_ONCE = 2000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExactProcess:
+    """One component's process: kernel, length, signal and noise sd."""
+
+    kernel: Kernel
+    length_m: float
+    signal_sd_uT: float
+    noise_sd_uT: float
+
+    def condition(self, position_m: Array, deviation_uT: Array) -> "ExactPosterior":
+        """Given features (n,) about the ambient field at positions (n, d)."""
+        gram = self.signal_sd_uT**2 * covariance(self.kernel, _distances_m(position_m, position_m), self.length_m)
+        gram[np.diag_indices_from(gram)] += self.noise_sd_uT**2
+        factor = cho_factor(gram, lower=True, check_finite=False)
+        return ExactPosterior(self, position_m, factor[0], cho_solve(factor, deviation_uT, check_finite=False))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExactPosterior:
+    """A process conditioned on observations (Rasmussen & Williams 2006, algorithm 2.1)."""
+
+    process: ExactProcess
+    position_m: Array
+    factor: Array
+    dual_uT: Array
+
+    def at(self, points_m: Array) -> tuple[Array, Array]:
+        """Mean (n,) about the ambient field and latent variance over the prior's (n,)."""
+        prior = covariance(
+            self.process.kernel, _distances_m(points_m, self.position_m), self.process.length_m
+        ) * np.square(self.process.signal_sd_uT)
+        explained = np.sum(np.square(solve_triangular(self.factor, prior.T, lower=True, check_finite=False)), axis=0)
+        return prior @ self.dual_uT, np.maximum(1.0 - explained / self.process.signal_sd_uT**2, 0.0)
+
+    def gradient_at(self, points_m: Array) -> Array:
+        """(n, 2) exact derivative of the mean with x and y, uT/m."""
+        slope = covariance_slope(
+            self.process.kernel, _distances_m(points_m, self.position_m), self.process.length_m
+        ) * np.square(self.process.signal_sd_uT)
+        weighted = slope * self.dual_uT
+        return np.asarray(points_m[:, :2] * weighted.sum(axis=1, keepdims=True) - weighted @ self.position_m[:, :2])
+
+
+def learn_exact(kernel: Kernel, position_m: Array, deviation_uT: Array) -> ExactProcess:
+    """Hyper-parameters of one component by scikit-learn's marginal likelihood (Kuevor B8).
+
+    scikit-learn takes seconds to import and only this needs it, so it is imported here.
+    """
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+
+    spread = max(float(np.std(deviation_uT)), 1e-3)
+    limits_m = (0.1, 50.0)
+    shape = RBF(1.0, limits_m) if kernel == "squared_exponential" else Matern(1.0, limits_m, MATERN_SMOOTHNESS[kernel])
+    signal = ConstantKernel(spread**2, (1e-4 * spread**2, 1e4 * spread**2))
+    white = WhiteKernel((0.1 * spread) ** 2, (1e-8 * spread**2, 10 * spread**2))
+    regressor = GaussianProcessRegressor(signal * shape + white, alpha=0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a parameter at its bound: a flat field, not a failure
+        regressor.fit(position_m, deviation_uT)
+    log_signal, log_length, log_noise = regressor.kernel_.theta
+    return ExactProcess(kernel, float(np.exp(log_length)), float(np.exp(log_signal / 2)), float(np.exp(log_noise / 2)))
+
+
+def estimate_by_exact(
+    walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, height_m: float | None, progress: Progress
+) -> FieldEstimate:
+    """The exact posterior of every component; surveys left out by honest refits at the same hyper-parameters.
+
+    Raises InvalidInput above MAX_OBSERVATIONS.
+    """
+    position_m = np.concatenate([walk.position_m for walk in walks])
+    deviation_uT = np.concatenate([walk.field_uT for walk in walks]) - ambient_uT
+    if len(position_m) > MAX_OBSERVATIONS:
+        raise InvalidInput(
+            f"the exact engine takes at most {MAX_OBSERVATIONS} observations and the surveys have {len(position_m)}: "
+            "use engine hilbert"
+        )
+    processes = []
+    for component, target in enumerate(deviation_uT.T):
+        progress(0.5 * component / len(ambient_uT), f"learning component {component + 1} of {len(ambient_uT)}")
+        processes.append(learn_exact(spec.kernel, position_m, target))
+    frame = GridFrame.around(walks, spec.resolution_m, max(p.length_m for p in processes), height_m)
+    posteriors = [p.condition(position_m, y) for p, y in zip(processes, deviation_uT.T, strict=True)]
+    mean_uT, variance_ratio, gradient = _on_cells(posteriors, frame, progress)
+    held_out = {walk.survey_id: _predict_left_out(walk, walks, processes, ambient_uT) for walk in walks}
+    return FieldEstimate(
+        frame=frame,
+        mean_uT=mean_uT,
+        variance_ratio=variance_ratio,
+        gradient_uT_per_m=gradient,
+        prior_sd_uT=np.array([p.signal_sd_uT for p in processes]),
+        error_sd_uT=np.array([p.noise_sd_uT for p in processes]),
+        held_out_mean_uT={name: mean for name, (mean, _) in held_out.items()},
+        held_out_variance_ratio={name: variance for name, (_, variance) in held_out.items()},
+        hyperparameters={
+            "kernel": spec.kernel,
+            "length_m": [p.length_m for p in processes],
+            "signal_sd_ut": [p.signal_sd_uT for p in processes],
+            "white_noise_sd_ut": [p.noise_sd_uT for p in processes],
+        },
+    )
+
+
+def _on_cells(posteriors: Sequence[ExactPosterior], frame: GridFrame, progress: Progress) -> tuple[Array, Array, Array]:
+    """Mean and variance ratio (c, ny, nx), gradient (2, c, ny, nx) at the cell centres, some at a time."""
+    x_m, y_m = np.meshgrid(frame.x_m, frame.y_m)
+    centres_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, frame.height_m)])
+    mean, variance = np.zeros((2, len(posteriors), len(centres_m)))
+    gradient = np.zeros((2, len(posteriors), len(centres_m)))
+    for start in range(0, len(centres_m), CELLS_AT_ONCE):
+        progress(0.5 + 0.4 * start / len(centres_m), "predicting the cells of the grid")
+        some = slice(start, start + CELLS_AT_ONCE)
+        for c, fitted in enumerate(posteriors):
+            mean[c, some], variance[c, some] = fitted.at(centres_m[some])
+            gradient[:, c, some] = fitted.gradient_at(centres_m[some]).T
+    cells = (len(posteriors), *frame.shape)
+    return mean.reshape(cells), variance.reshape(cells), gradient.reshape(2, *cells)
+
+
+def _predict_left_out(
+    left_out: Walk, walks: Sequence[Walk], processes: Sequence[ExactProcess], ambient_uT: Array
+) -> tuple[Array, Array]:
+    """Mean and variance ratio (n, c) of a walk's observations from a refit without it."""
+    others = [walk for walk in walks if walk is not left_out]
+    if not others:
+        return np.zeros(left_out.field_uT.shape), np.ones(left_out.field_uT.shape)
+    position_m = np.concatenate([walk.position_m for walk in others])
+    deviation_uT = np.concatenate([walk.field_uT for walk in others]) - ambient_uT
+    predictions = [
+        process.condition(position_m, target).at(left_out.position_m)
+        for process, target in zip(processes, deviation_uT.T, strict=True)
+    ]
+    mean, variance = (np.stack(columns, axis=1) for columns in zip(*predictions, strict=True))
+    return mean, variance
+
+
+def _distances_m(a: Array, b: Array) -> Array:
+    """(n, m) distances between points (n, d) and (m, d)."""
+    return np.asarray(cdist(a, b))
