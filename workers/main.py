@@ -124,7 +124,8 @@ def _wait(stop: threading.Event, parent: int | None) -> bool:
 
 def _leave(lease: Lease, client: DBOSClient, drain_s: float) -> None:
     """Take nothing new, let running jobs finish, and leave the rest to the others."""
-    DBOS.destroy(workflow_completion_timeout_sec=ceil(drain_s))
+    busy = has_unfinished_jobs(client, lease.worker_id)
+    DBOS.destroy(workflow_completion_timeout_sec=ceil(drain_s) if busy else 0)
     unfinished = has_unfinished_jobs(client, lease.worker_id)
     lease.release(unfinished=unfinished)
     if unfinished:
