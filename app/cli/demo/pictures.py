@@ -11,6 +11,7 @@ from app.geometry import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 __all__ = ["draw_errors", "draw_floor"]
@@ -20,6 +21,7 @@ ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = "#E69F00", "#56B4E9", "#009E73", "
 _COLOURS = (SKY, ORANGE, GREEN, PURPLE, BLUE, VERMILION)
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _MOST_FIXES = 14
+_UNMAPPED = "#e6e6e6"
 _DPI = 130
 
 
@@ -27,7 +29,7 @@ def draw_floor(path: Path, floor: MappedFloor, answers: list[Answer]) -> None:
     """The map of |B| with unseen walks, their fixes and 95 % circles; beside it the stated uncertainty and surveys."""
     extent = _extent(floor)
     wide = (extent[1] - extent[0]) / (extent[3] - extent[2])
-    figure = _figure(13.0, float(np.clip(6.2 / max(wide, 0.8) * 1.35, 4.2, 9.0)))
+    figure = _figure(13.0, float(np.clip(4.9 / wide + 1.5, 3.6, 9.0)))
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     norm, sd = _norm_and_sd_uT(floor)
     _show(figure, left, norm, extent, "viridis", "|B| (µT)")
@@ -37,9 +39,10 @@ def draw_floor(path: Path, floor: MappedFloor, answers: list[Answer]) -> None:
     for track in floor.tracks_m:
         right.plot(track[:, 0], track[:, 1], color="white", lw=0.5, alpha=0.55)
     right.set_title(f"{floor.name}: stated uncertainty and the {len(floor.tracks_m)} surveys", fontsize=10)
+    margin = 0.02 * max(extent[1] - extent[0], extent[3] - extent[2])
     for axes in (left, right):
-        axes.set_xlabel("x (m)")
-        axes.set_aspect("equal")
+        axes.set(xlabel="x (m)", xlim=(extent[0] - margin, extent[1] + margin))
+        axes.set(aspect="equal", ylim=(extent[2] - margin, extent[3] + margin))
         _scale_bar(axes, extent)
     left.set_ylabel("y (m)")
     figure.savefig(path, dpi=_DPI)
@@ -82,15 +85,15 @@ def _show(
     low, high = np.nanquantile(values, [0.01, 0.99])
     image: Any = axes.imshow(values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high)
     figure.colorbar(image, ax=axes, label=label, shrink=0.85, extend="both")
-    axes.set_facecolor("#e6e6e6")
+    axes.set_facecolor(_UNMAPPED)
 
 
 def _draw_fixes(axes: "Axes", floor: MappedFloor, answers: list[Answer]) -> None:
-    """The longest windows whose truth is on this floor; those placed on another floor keep only their truth."""
+    """Windows whose truth is on this floor, clear fixes and long ones first; on a wrong floor only the truth shows."""
     from matplotlib.patches import Circle
 
     mine = [each for each in answers if _floor_of(each, floor)]
-    longest = sorted(mine, key=lambda each: (not each.question.covered, -each.question.length_m))[:_MOST_FIXES]
+    longest = sorted(mine, key=lambda each: (each.fix["status"] != "fix", -each.question.length_m))[:_MOST_FIXES]
     for each in longest:
         axes.plot(*each.question.path_m.T, color="white", lw=1.4, alpha=0.9, solid_capstyle="round")
     for each in longest:
@@ -101,8 +104,8 @@ def _draw_fixes(axes: "Axes", floor: MappedFloor, answers: list[Answer]) -> None
             continue
         x, y = belief["position_m"][:2]
         axes.plot([truth[0], x], [truth[1], y], color=VERMILION, lw=1.0, zorder=3)
-        axes.plot(x, y, "o", color=VERMILION, mec="white", mew=0.8, ms=5, zorder=5)
-        axes.add_patch(Circle((x, y), belief["radius_95_m"], fill=False, color=VERMILION, lw=1.3, zorder=3))
+        axes.plot(x, y, "o", color=VERMILION, mec="white", mew=0.6, ms=4, zorder=5)
+        axes.add_patch(Circle((x, y), belief["radius_95_m"], fill=False, color=VERMILION, lw=1.4, zorder=6))
     _legend(axes)
 
 
@@ -112,6 +115,7 @@ def _floor_of(answer: Answer, floor: MappedFloor) -> bool:
 
 def _legend(axes: "Axes") -> None:
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
     axes.legend(
         handles=[
@@ -119,8 +123,9 @@ def _legend(axes: "Axes") -> None:
             Line2D([], [], color="black", marker="x", ls="", mew=1.8, label="truth"),
             Line2D([], [], color=VERMILION, marker="o", mec="white", ls="", label="estimate"),
             Line2D([], [], color=VERMILION, marker="o", mfc="none", ms=11, ls="", label="95 % radius"),
+            Patch(facecolor=_UNMAPPED, edgecolor="#808080", label="not mapped"),
         ],
-        loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=4, fontsize=8, facecolor="#bdbdbd", framealpha=1.0,
+        loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, fontsize=8, facecolor="#c8c8c8", framealpha=1.0,
     )  # fmt: skip
 
 
@@ -143,8 +148,9 @@ def _draw_calibration(axes: "Axes", beliefs: list[Judged]) -> None:
     lengths = sorted({each.answer.question.length_m for each in beliefs})
     answered = [each for each in beliefs if each.error_m is not None]
     finite = [each.error_m for each in answered if each.error_m is not None and np.isfinite(each.error_m)]
-    values = np.array(finite + [each.radius_95_m for each in answered] + [0.1, 1.0])
-    low, high = 0.5 * max(float(values.min()), 0.005), 2.0 * float(values.max())
+    radii = np.array([each.radius_95_m for each in answered])
+    low, high = 0.5 * max(min([*finite, 0.1]), 0.01), 2.0 * max([*finite, 1.0])
+    narrow, wide = 0.7 * float(radii.min()), 1.5 * float(radii.max())
     for length_m, colour, marker in zip(lengths, _COLOURS, _MARKERS, strict=False):
         mine = [each for each in answered if each.answer.question.length_m == length_m]
         right = np.array([[each.radius_95_m, each.error_m] for each in mine if each.right_floor]).reshape(-1, 2)
@@ -152,10 +158,13 @@ def _draw_calibration(axes: "Axes", beliefs: list[Judged]) -> None:
         style: dict[str, Any] = {"color": colour, "marker": marker, "ls": "", "ms": 6, "mec": "white", "mew": 0.6}
         axes.plot(right[:, 0], np.maximum(right[:, 1], low), label=f"{length_m:g} m walked", **style)
         axes.plot(wrong, np.full(len(wrong), high / 1.25), **(style | {"mec": "black", "mew": 1.2}))
-    axes.plot([low, high], [low, high], color="black", lw=1.0)
-    axes.fill_between([low, high], [low, high], low, color=GREEN, alpha=0.08, lw=0)
+    line = [min(low, narrow), max(high, wide)]
+    axes.plot(line, line, color="black", lw=1.0)
+    axes.fill_between(line, line, line[0], color=GREEN, alpha=0.08, lw=0)
     axes.text(0.97, 0.04, "stated radius held", transform=axes.transAxes, ha="right", fontsize=9, color="#00664b")
-    axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+    axes.set(xscale="log", yscale="log", xlim=(narrow, wide), ylim=(low, high))
+    _plain_ticks(axes.xaxis)
+    _plain_ticks(axes.yaxis)
     axes.set(xlabel="stated 95 % radius (m)", ylabel="true error (m)")
     held = np.mean([each.error_m is not None and each.error_m <= each.radius_95_m for each in answered])
     axes.set_title(f"{held:.0%} of {len(answered)} windows within their 95 % radius", fontsize=10)
@@ -163,16 +172,30 @@ def _draw_calibration(axes: "Axes", beliefs: list[Judged]) -> None:
     axes.grid(which="both", color="#d9d9d9", lw=0.4)
 
 
+def _plain_ticks(axis: "Axis") -> None:
+    """Logarithmic ticks at 1, 2 and 5, written out."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
 def _draw_shares(axes: "Axes", judged: list[Judged]) -> None:
     """Share of all windows asked that a technique placed within a distance; techniques that decline end lower."""
     names = {"ml": "maximum likelihood", "mlr": "likelihood ratio", "abl": "aggregate bins", "posterior": "posterior"}
     dashes: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), "-.")
+    finite = [each.error_m for each in judged if each.error_m is not None and np.isfinite(each.error_m)]
+    low, high = (max(0.02, 0.8 * min(finite)), 1.3 * max(finite)) if finite else (0.1, 10.0)
     for technique, colour, dash in zip(TECHNIQUES, (BLUE, ORANGE, GREEN, VERMILION), dashes, strict=True):
         mine = [each for each in judged if each.technique == technique]
         errors = np.sort([each.error_m for each in mine if each.error_m is not None and np.isfinite(each.error_m)])
         share = np.arange(1, len(errors) + 1) / max(len(mine), 1)
+        errors, share = np.append(errors, high), np.append(share, share[-1] if len(share) else 0.0)
         axes.step(errors, 100 * share, where="post", color=colour, ls=dash, lw=1.8, label=names[technique])
-    axes.set(xscale="log", xlabel="true error (m)", ylabel="windows placed within that distance (%)", ylim=(0, 101))
-    axes.set_title("Every window asked counts; those declined never arrive", fontsize=10)
+    axes.set(xscale="log", xlim=(low, high), ylim=(0, 101))
+    axes.set(xlabel="true error (m)", ylabel="windows placed within that distance (%)")
+    _plain_ticks(axes.xaxis)
+    axes.set_title("Share of all windows asked; a technique that declines ends below 100 %", fontsize=10)
     axes.legend(loc="lower right", fontsize=8)
     axes.grid(which="both", color="#d9d9d9", lw=0.4)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from app.cli.demo.journey import Answer, MappedFloor
@@ -46,50 +47,50 @@ def _judged(answer: Answer, technique: str, floor_ids: list[str]) -> Judged:
 
 def map_table(floors: list[MappedFloor]) -> Table:
     """Every floor's map: how well it predicts the walk left out, the true field, and which walks fit the others."""
-    table = Table(title="Maps", caption="each survey predicted from the others; components in the order of the map")
-    for name in ("floor", "surveys", "mapped m²", "components", "RMSE µT", "within 2 sd", "walks that fit"):
-        table.add_column(name, justify="left" if name in ("floor", "components") else "right")
-    known = any(floor.error_uT is not None for floor in floors)
-    if known:
-        table.add_column("true RMSE µT", justify="right")
+    components = " ".join(floors[0].quality["components"])
+    table = _table(
+        "Maps",
+        f"{components}; each survey is predicted from all the others; fit: consistent with them",
+        ["floor", "walks", "mapped\nm²", "RMSE\nµT", "within 2\nsd, %", "fit the\nothers", "true RMSE\nµT"],
+    )
     for floor in floors:
         score, verdicts = floor.map["score"], _verdicts(floor)
-        row = [
+        table.add_row(
             floor.name,
             str(len(floor.map["survey_ids"])),
             f"{floor.quality['measured_area_m2']:,.0f}",
-            " ".join(floor.quality["components"]),
             _numbers(score["rmse_ut"], ".2f") if score else "-",
-            _numbers([100 * x for x in score["coverage_2sigma"]], ".0f", " %") if score else "-",
+            _numbers([100 * x for x in score["coverage_2sigma"]], ".0f") if score else "-",
             f"{verdicts['consistent']} of {verdicts['consistent'] + verdicts['inconsistent']}",
-        ]
-        if known:
-            row.append("-" if floor.error_uT is None else _numbers(_rms(floor.error_uT).tolist(), ".2f"))
-        table.add_row(*row)
+            "unknown" if floor.error_uT is None else _numbers(_rms(floor.error_uT).tolist(), ".2f"),
+        )
     return table
 
 
 def position_table(judged: list[Judged]) -> Table:
     """True error against stated 95 % radius, per window length and technique."""
-    table = Table(
-        title="Positions of windows from unseen walks, any floor, no prior",
-        caption="errors are horizontal, a wrong floor is an infinite error; held: true error within the stated radius",
-    )
-    columns = ("window", "technique", "asked", "answered", "right floor", "error 50 %", "error 95 %",
-               "stated 95 % radius", "held")  # fmt: skip
-    for name in columns:
-        table.add_column(name, justify="left" if name == "technique" else "right")
-    lengths = sorted({each.answer.question.length_m for each in judged})
-    for length_m in lengths:
+    table = _table(
+        "Positions of windows from unseen walks: any floor, no prior",
+        "errors: horizontal, infinite on a wrong floor; stated: median radius; held: error within it",
+        ["technique", "window\nm", "asked", "answered\n%", "right\nfloor %", "error m\nmedian", "error m\n95 %",
+         "stated m\n95 %", "held\n%"],
+    )  # fmt: skip
+    for length_m in sorted({each.answer.question.length_m for each in judged}):
         for technique in TECHNIQUES:
             mine = [e for e in judged if e.technique == technique and e.answer.question.length_m == length_m]
             row = summary(mine)
             table.add_row(
-                f"{length_m:g} m" if technique == TECHNIQUES[0] else "", _NAMES[technique], str(row["asked"]),
-                _percent(row["answered"]), _percent(row["right_floor"]), _metres(row["error_50_m"]),
-                _metres(row["error_95_m"]), _metres(row["radius_95_m"]), _percent(row["held"]),
-                end_section=technique == TECHNIQUES[-1],
+                _NAMES[technique], f"{length_m:g}", str(row["asked"]), _percent(row["answered"]),
+                _percent(row["right_floor"]), _metres(row["error_50_m"]), _metres(row["error_95_m"]),
+                _metres(row["radius_95_m"]), _percent(row["held"]), end_section=technique == TECHNIQUES[-1],
             )  # fmt: skip
+    return table
+
+
+def _table(title: str, caption: str, columns: list[str]) -> Table:
+    table = Table(title=title, caption=caption, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for k, name in enumerate(columns):
+        table.add_column(name, justify="right" if k else "left", no_wrap=True)
     return table
 
 
@@ -198,15 +199,15 @@ def _finite(row: dict[str, Any]) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
-def _numbers(values: list[float], form: str, unit: str = "") -> str:
-    return " ".join(f"{value:{form}}" for value in values) + unit
+def _numbers(values: list[float], form: str) -> str:
+    return " ".join(f"{value:{form}}" for value in values)
 
 
 def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.0f} %"
+    return "-" if share is None else f"{100 * share:.0f}"
 
 
 def _metres(length_m: float | None) -> str:
     if length_m is None:
         return "-"
-    return f"{length_m:.2f} m" if np.isfinite(length_m) else "wrong floor"
+    return f"{length_m:.2f}" if np.isfinite(length_m) else "floor"
