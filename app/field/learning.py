@@ -24,8 +24,10 @@ __all__ = ["learn_hyperparameters"]
 LEARNING_TILES = 6
 LEARNING_FUNCTIONS = 14
 ROUNDS = 6
-FINEST, COARSEST = 8.0, 1.5
-"""A tile can tell lengths between an eighth of its pitch (its functions) and two thirds of it (its size)."""
+LEARNABLE = (8.0, 1.0)
+"""A tile can tell lengths between an eighth of its pitch (its functions are no finer) and all of it (its size)."""
+GOOD_ENOUGH = 1.5
+"""A lattice whose pitch is within this factor of the suited one learns the same length."""
 
 FAINT_WALK_NOISE = WalkNoise(variance_ratio=0.3, length_m=1.5)
 WORTH_NATS = 3.0
@@ -50,7 +52,7 @@ class _Learner:
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel) -> None:
         self._kernel = kernel
         self._pin_bias = len(walks) == 1
-        self._length_bounds_m = (lattice.pitch_m / FINEST, lattice.pitch_m / COARSEST)
+        self._length_bounds_m = (lattice.pitch_m / LEARNABLE[0], lattice.pitch_m / LEARNABLE[1])
         few = Lattice(lattice.pitch_m, functions_per_axis=LEARNING_FUNCTIONS)
         self._tiled = TiledWalks(few, walks, ambient_uT)
         self._chosen = _well_walked(self._tiled.counts())
@@ -67,19 +69,19 @@ def learn_hyperparameters(
     walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel, progress: Progress
 ) -> tuple[Hyperparameters, Lattice]:
     """Maximum marginal likelihood, and the lattice that suits the length it finds."""
-    lattice = Lattice.for_length(float(np.exp(START_LOG[0])))
+    lattice = Lattice.for_length(kernel, float(np.exp(START_LOG[0])))
     start_log = START_LOG
     for turn in range(ROUNDS):
         progress(0.5 * turn / ROUNDS, "learning length and noise")
         learner = _Learner(lattice, walks, ambient_uT, kernel)
         white = learner.learn(WHITE, start_log)
         start_log = white.log_parameters
-        suited = Lattice.for_length(white.hyper.length_m)
-        if suited == lattice:
+        suited = Lattice.for_length(kernel, white.hyper.length_m)
+        if 1.0 / GOOD_ENOUGH <= suited.pitch_m / lattice.pitch_m <= GOOD_ENOUGH:
             break
         lattice = suited
     hyper = _learn_walk_noise(learner, white, progress).hyper
-    return hyper, Lattice.for_length(hyper.length_m)
+    return hyper, Lattice.for_length(kernel, hyper.length_m)
 
 
 def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:

@@ -102,7 +102,7 @@ def learn(
         jac=True,
         method="L-BFGS-B",
         bounds=list(map(tuple, bounds.tolist())),
-        options={"maxiter": MAX_ITERATIONS, "ftol": 1e-7},
+        options={"maxiter": MAX_ITERATIONS, "ftol": 1e-6},
     )
     likelihood = negative_log_likelihood(tiles, kernel, best.x)
     length_m, white_ratio, bias_ratio = (float(v) for v in np.exp(best.x))

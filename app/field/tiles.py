@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.field.basis import CosineBasis
+from app.field.spec import Kernel
 from app.geometry import Array
 
 __all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "Lattice", "Tile"]
 
-PITCHES_M = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0)
-PITCH_IN_LENGTHS = 3.0
+PITCHES_M = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 64.0, 100.0)
+PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
+"""A rough kernel has detail finer than its length and wants functions packed closer than a smooth one."""
 MARGIN = 0.3
 OVERLAP = 0.1
 FUNCTIONS_PER_AXIS = 20
@@ -41,9 +43,9 @@ class Lattice:
     functions_per_axis: int = FUNCTIONS_PER_AXIS
 
     @classmethod
-    def for_length(cls, length_m: float) -> "Lattice":
-        """The finest lattice whose pitch is at least three length scales: the box then spans five to seven."""
-        pitch = next((p for p in PITCHES_M if p >= PITCH_IN_LENGTHS * length_m), PITCHES_M[-1])
+    def for_length(cls, kernel: Kernel, length_m: float) -> "Lattice":
+        """The finest lattice whose tiles are wide enough for a kernel of this length."""
+        pitch = next((p for p in PITCHES_M if p >= PITCH_IN_LENGTHS[kernel] * length_m), PITCHES_M[-1])
         return cls(pitch)
 
     def basis(self, tile: Tile) -> CosineBasis:

@@ -1,0 +1,91 @@
+"""Against the dense covariance that the statistics stand for."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from app.field.basis import CosineBasis
+from app.field.kernels import spectral_density
+from app.field.marginal_likelihood import TileStatistics, learn, negative_log_likelihood
+from app.field.statistics import survey_statistics
+from app.field.walk_noise import WHITE, WalkNoise
+
+BASIS = CosineBasis((0.0, 0.0), 8.0, 9)
+NOISE = WalkNoise(2.0, 1.5)
+
+
+def walks(noise, components=2, seed=0):
+    rng = np.random.default_rng(seed)
+    result = []
+    for _ in range(3):
+        n = 30
+        points = np.cumsum(rng.normal(0.0, 0.4, (n, 2)), axis=0) + rng.uniform(2.0, 6.0, 2)
+        points = np.clip(points, 0.0, 8.0)
+        path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        y = 3.0 * np.sin(points @ rng.normal(size=(2, components))) + rng.normal(0.0, 0.5, (n, components)) + 1.0
+        result.append((points, y, path))
+    return result
+
+
+def tile(data, noise):
+    return TileStatistics(BASIS, {str(i): survey_statistics(BASIS, *walk, noise) for i, walk in enumerate(data)})
+
+
+def dense_covariance(data, noise, length, white, bias, kernel):
+    points = np.concatenate([p for p, _, _ in data])
+    phi = BASIS.at(points)
+    covariance = (phi * spectral_density(kernel, BASIS.frequencies_squared, length)) @ phi.T
+    start = 0
+    for p, _, path in data:
+        block = slice(start, start + len(p))
+        shape = np.eye(len(p)) + noise.variance_ratio * np.exp(-np.abs(path[:, None] - path) / noise.length_m)
+        covariance[block, block] += white * shape + bias
+        start += len(p)
+    return covariance
+
+
+@pytest.mark.parametrize("noise", [WHITE, NOISE])
+@pytest.mark.parametrize("kernel", ["squared_exponential", "matern32", "matern52"])
+def test_value_equals_the_density_of_the_dense_gaussian(kernel, noise):
+    data = walks(noise)
+    parameters = np.log([1.8, 0.05, 0.02])
+    likelihood = negative_log_likelihood([tile(data, noise)], kernel, parameters)
+    covariance = dense_covariance(data, noise, 1.8, 0.05, 0.02, kernel)
+    y = np.concatenate([walk[1] for walk in data])
+    naive = -sum(
+        multivariate_normal(cov=variance * covariance).logpdf(column)
+        for variance, column in zip(likelihood.signal_variance_uT2, y.T, strict=True)
+    )
+    assert likelihood.value == pytest.approx(naive, rel=1e-5)
+    assert np.allclose(likelihood.signal_variance_uT2, [c @ np.linalg.solve(covariance, c) / len(c) for c in y.T])
+
+
+@pytest.mark.parametrize("noise", [WHITE, NOISE])
+@pytest.mark.parametrize("parameters", [(1.8, 0.05, 0.02), (0.9, 1.0, 1e-4), (5.0, 1e-3, 1.0)])
+def test_gradient_equals_finite_differences(parameters, noise):
+    tiles, at, h = [tile(walks(noise, seed=s), noise) for s in (0, 1)], np.log(parameters), 1e-5
+    gradient = negative_log_likelihood(tiles, "matern32", at).gradient
+    numeric = [
+        (
+            negative_log_likelihood(tiles, "matern32", at + h * e).value
+            - negative_log_likelihood(tiles, "matern32", at - h * e).value
+        )
+        / (2 * h)
+        for e in np.eye(3)
+    ]
+    assert np.allclose(gradient, numeric, rtol=1e-5, atol=1e-4)
+
+
+def test_learning_never_ends_below_where_it_started():
+    tiles = [tile(walks(WHITE, seed=3), WHITE)]
+    start = np.log([3.0, 1e-2, 1e-3])
+    _, _, value = learn(tiles, "matern32", WHITE, start)
+    assert value < negative_log_likelihood(tiles, "matern32", start).value
+
+
+def test_a_constant_field_is_learned_without_dividing_by_zero():
+    points, _, path = walks(WHITE)[0]
+    flat = TileStatistics(BASIS, {"a": survey_statistics(BASIS, points, np.zeros((len(points), 1)), path, WHITE)})
+    hyper, _, value = learn([flat], "matern32", WHITE)
+    assert np.isfinite(value)
+    assert hyper.signal_sd_uT[0] < 0.1

@@ -1,0 +1,43 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.field.tiles import Lattice, Tile
+
+COORDINATES = st.floats(-200.0, 200.0, allow_nan=False)
+
+
+@given(x=COORDINATES, y=COORDINATES, pitch=st.sampled_from([1.5, 4.0, 16.0]))
+def test_weights_sum_to_one_everywhere(x, y, pitch):
+    lattice, point = Lattice(pitch), np.array([[x, y]])
+    total = sum(
+        lattice.weight(0, tile, point[:, 0]) * lattice.weight(1, tile, point[:, 1]) for tile in lattice.answering(point)
+    )
+    assert np.allclose(total, 1.0, atol=1e-12)
+
+
+@given(x=COORDINATES)
+def test_weight_slope_is_the_derivative_of_the_weight(x):
+    lattice, at, h = Lattice(8.0), np.array([x]), 1e-5
+    tile = Tile(int(np.floor(x / 8.0)), 0)
+    numeric = (lattice.weight(0, tile, at + h) - lattice.weight(0, tile, at - h)) / (2 * h)
+    assert np.allclose(lattice.weight_slope(0, tile, at), numeric, atol=1e-5)
+
+
+def test_a_tile_is_fitted_from_every_point_it_answers_and_more():
+    lattice = Lattice(4.0)
+    points = np.random.default_rng(0).uniform(-9.0, 9.0, (400, 2))
+    fitting = lattice.fitting(points)
+    for tile, answered in lattice.answering(points).items():
+        assert set(answered) <= set(fitting[tile])
+    for tile, inside in fitting.items():
+        basis = lattice.basis(tile)
+        assert np.all(points[inside] >= np.array(basis.corner_m) - 1e-9)
+        assert np.all(points[inside] <= np.array(basis.corner_m) + basis.side_m + 1e-9)
+
+
+def test_tiles_do_not_depend_on_the_other_points():
+    lattice = Lattice(4.0)
+    points = np.random.default_rng(0).uniform(-9.0, 9.0, (100, 2))
+    alone = {tile for p in points[:10] for tile in lattice.fitting(p[None])}
+    assert alone <= set(lattice.fitting(points))
