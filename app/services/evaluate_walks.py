@@ -10,7 +10,7 @@ import gzip
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from app.field.spec import FittedMap, MapSpec, Score
 from app.geometry import Array
 from app.positioning.fix import Fix, LocateOptions
 from app.positioning.locate import SearchableFloor, locate, prepare_floor
-from app.positioning.window import Window
+from app.positioning.window import Composition, Window
 from app.survey.read import read_survey
 from app.survey.walk import DeadReckoning, Walk
 
@@ -50,8 +50,9 @@ class EvaluationPlan:
     """What to evaluate: window lengths in metres walked, the map's parameters, child processes."""
 
     window_lengths_m: tuple[float, ...] = (10.0, 20.0, 40.0)
-    spec: MapSpec = MapSpec()
-    options: LocateOptions = LocateOptions()
+    spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0))
+    composition: Composition = "raw"
+    options: LocateOptions = field(default_factory=LocateOptions)
     processes: int = 2
 
 
@@ -249,11 +250,12 @@ def _judge_walk(floor_id: str, name: str, walk: Walk, mapped_m: Array) -> list[J
     """Every window of one held-out walk, located over all floors without a prior."""
     assert walk.dead_reckoning is not None
     p_m = walk.samples.p_building_m[:, :2]
-    near = cKDTree(mapped_m).query(p_m)[0] <= COVERED_WITHIN_M
+    distance_m, _ = cKDTree(mapped_m).query(p_m)
+    near = np.asarray(distance_m) <= COVERED_WITHIN_M
     judged = []
     for length_m in _plan.window_lengths_m:
         for part, window in cut_windows(walk.dead_reckoning, length_m):
-            fix = locate(window, _floors, options=_plan.options)
+            fix = locate(window, _floors, composition=_plan.composition, options=_plan.options)
             covered = bool(near[part].mean() >= COVERED_SHARE)
             judged.append(_judge(fix, floor_id, name, length_m, covered, p_m[part][-1]))
     return judged
