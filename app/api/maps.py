@@ -1,6 +1,7 @@
 """Maps: ask for one, look at it, ask it for the field, take it away as a file or a picture."""
 
 from datetime import datetime
+from hashlib import sha256 as sha256_of
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
@@ -20,6 +21,7 @@ from app.db.tables import Floor, Map, Survey
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
+from app.services.artefacts import samples_from_bytes
 from app.services.export_map import MEDIA_TYPES, ExportFormat, export_map
 
 __all__ = ["MapView", "router"]
@@ -36,6 +38,7 @@ class NewMap(RequestModel):
     engine: Literal["hilbert", "exact"] = "hilbert"
     components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
     kernel: Literal["squared_exponential", "matern32", "matern52"] | None = None
+    curl_free: Annotated[Literal[False], Field(description="components are independent in this version")] = False
     resolution_m: Annotated[Finite, Field(ge=0.05, le=5.0)] = 0.25
     heights_m: Annotated[list[Metres], Field(min_length=1, max_length=1)] | None = None
     survey_ids: Annotated[
@@ -150,7 +153,7 @@ def create_map(
             floor_id=floor.id,
             status="accepted",
             activate=body.activate,
-            spec=body.model_dump(exclude={"survey_ids", "activate"}, exclude_none=True),
+            spec=body.model_dump(exclude={"survey_ids", "activate", "curl_free"}, exclude_none=True),
             survey_ids=_check_surveys(session, floor.id, body),
         )
         session.add(row)
@@ -269,11 +272,24 @@ def get_heatmap(
     responses={200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
 )
 def get_view(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
+    from app.viewer.database_source import rings_of_polygon
+    from app.viewer.source import Walk
     from app.viewer.static_view import static_view_html  # viser is loaded only when somebody looks
 
     grid, sha256 = _ready_grid(context, identity, map_id)
-    title = f"Magnetic map {map_id}"
-    return _immutable(request, f"{sha256}-view", lambda: static_view_html(grid, [], title).encode(), "text/html")
+    with context.transaction() as session:
+        row = _find_map(session, identity, map_id)
+        floor = session.get_one(Floor, row.floor_id)
+        surveys = session.scalars(select(Survey).where(Survey.id.in_(row.survey_ids)).order_by(Survey.id)).all()
+
+    def page() -> bytes:
+        samples = [samples_from_bytes(context.blobs.get(survey.samples_sha256)) for survey in surveys]
+        walks = [Walk(s.id, s.name, w.p_building_m, w.B_uT) for s, w in zip(surveys, samples, strict=True)]
+        rings, title = rings_of_polygon(floor.outline), f"{floor.name}: magnetic map"
+        return static_view_html(grid, walks, title, rings, floor.elevation_m).encode()
+
+    shown = sha256_of(" ".join([sha256, *(survey.id for survey in surveys)]).encode()).hexdigest()
+    return _immutable(request, shown, page, "text/html")
 
 
 def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
