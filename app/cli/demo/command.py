@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from app.cli.client import Api
+    from app.cli.demo.connection import Connection
     from app.cli.demo.journey import Answer, MappedFloor
     from app.cli.demo.report import Judged
     from app.cli.demo.server import DemoServer
@@ -41,17 +41,18 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="the same seed makes the same building and walks")] = 2026,
 ) -> None:
     """Make a building, walk it, map it and locate unseen walks in it; then leave the server up."""
+    from app.cli.demo.connection import Connection
     from app.cli.demo.server import DemoError, clean_folder, running_server
     from app.errors import IsodynError
 
     console = Console(highlight=False)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with clean_folder(output) as folder:
+        with _terminated_like_interrupted(), clean_folder(output) as folder:
             shape = {"width_m": width_m, "depth_m": depth_m, "floors": floors}
             world = _world(console, data, windows, seed, shape)
             with running_server(folder, port) as server:
-                reasons = _show(console, server, world, folder)
+                with Connection(server) as api:
+                    reasons = _show(console, api, world, folder)
                 if not once:
                     _leave_up(console, server)
     except (DemoError, IsodynError) as error:
@@ -77,13 +78,11 @@ def _world(console: Console, data: Path | None, windows: int, seed: int, shape: 
         return synthetic_world(np.random.default_rng(seed), windows=windows, told=told, **shape)
 
 
-def _show(console: Console, server: "DemoServer", world: "World", folder: Path) -> list[str]:
+def _show(console: Console, api: "Connection", world: "World", folder: Path) -> list[str]:
     """Upload, map, ask, print, draw. The reasons why the result is absurd, if it is."""
-    from app.cli.client import Api
     from app.cli.demo import report as reporting
     from app.cli.demo.journey import ask, make_building, mapped_floors
 
-    api = Api(server.url, server.key)
     building_id, floor_ids = make_building(api, world)
     _map(console, api, world, floor_ids)
     floors = mapped_floors(api, world, floor_ids)
@@ -101,7 +100,7 @@ def _show(console: Console, server: "DemoServer", world: "World", folder: Path) 
     return reasons
 
 
-def _map(console: Console, api: "Api", world: "World", floor_ids: list[str]) -> None:
+def _map(console: Console, api: "Connection", world: "World", floor_ids: list[str]) -> None:
     """Upload every survey, then follow each floor's last job, which maps them all."""
     from app.cli.demo.journey import upload, wait_for_job
 
@@ -122,7 +121,7 @@ def _map(console: Console, api: "Api", world: "World", floor_ids: list[str]) -> 
 
 def _draw(
     console: Console,
-    api: "Api",
+    api: "Connection",
     folder: Path,
     floors: list["MappedFloor"],
     answers: list["Answer"],
@@ -152,6 +151,16 @@ def _leave_up(console: Console, server: "DemoServer") -> None:
     console.print(f"Sign in with the key [bold]{server.key}[/bold]   (Ctrl-C stops the server)", soft_wrap=True)
     code = server.process.wait()
     raise DemoError(f"the server ended by itself with code {code}; see {server.log}")
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """SIGTERM ends the demo as Ctrl-C does, so that its server is stopped too."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _progress(console: Console) -> Progress:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from app.cli.client import Api
+from app.cli.demo.connection import Connection
 from app.cli.demo.server import DemoError
 from app.cli.demo.world import DemoFloor, Question, Told, World
 from app.geometry import Array
@@ -51,14 +51,14 @@ class Answer:
     http_ms: float
 
 
-def make_building(api: Api, world: World) -> tuple[str, list[str]]:
+def make_building(api: Connection, world: World) -> tuple[str, list[str]]:
     """Make the building and its floors: their ids."""
     building_id = str(api.call("POST", "/v1/buildings", json={"name": world.building}).json()["id"])
     path = f"/v1/buildings/{building_id}/floors"
     return building_id, [str(api.call("POST", path, json=floor.body).json()["id"]) for floor in world.floors]
 
 
-def upload(api: Api, floor_id: str, floor: DemoFloor, told: Callable[[], None]) -> str:
+def upload(api: Connection, floor_id: str, floor: DemoFloor, told: Callable[[], None]) -> str:
     """Upload a floor's surveys; the id of the job that maps the last of them, and so all."""
     job_id = ""
     for survey in floor.surveys:
@@ -74,7 +74,7 @@ def upload(api: Api, floor_id: str, floor: DemoFloor, told: Callable[[], None]) 
     return job_id
 
 
-def wait_for_job(api: Api, job_id: str, told: Callable[[int, str], None]) -> dict[str, Any]:
+def wait_for_job(api: Connection, job_id: str, told: Callable[[int, str], None]) -> dict[str, Any]:
     """Poll a job until it ends well, telling progress and message. Raises DemoError when it does not."""
     while True:
         job: dict[str, Any] = api.call("GET", f"/v1/jobs/{job_id}").json()
@@ -87,12 +87,12 @@ def wait_for_job(api: Api, job_id: str, told: Callable[[int, str], None]) -> dic
     return job
 
 
-def mapped_floors(api: Api, world: World, floor_ids: list[str]) -> list[MappedFloor]:
+def mapped_floors(api: Connection, world: World, floor_ids: list[str]) -> list[MappedFloor]:
     """What the server now says of every floor."""
     return [_mapped_floor(api, world, k, floor_id) for k, floor_id in enumerate(floor_ids)]
 
 
-def ask(api: Api, building_id: str, questions: list[Question], told: Told) -> list[Answer]:
+def ask(api: Connection, building_id: str, questions: list[Question], told: Told) -> list[Answer]:
     """Ask for the position of every window, on any floor and without a prior."""
     answers = []
     for k, question in enumerate(questions):
@@ -103,7 +103,7 @@ def ask(api: Api, building_id: str, questions: list[Question], told: Told) -> li
     return answers
 
 
-def _mapped_floor(api: Api, world: World, index: int, floor_id: str) -> MappedFloor:
+def _mapped_floor(api: Connection, world: World, index: int, floor_id: str) -> MappedFloor:
     map_id = api.call("GET", f"/v1/floors/{floor_id}").json()["active_map_id"]
     if map_id is None:
         raise DemoError(f"{world.floors[index].name} has no active map although its job ended")
@@ -124,12 +124,12 @@ def _mapped_floor(api: Api, world: World, index: int, floor_id: str) -> MappedFl
     )
 
 
-def _track(api: Api, survey_id: str) -> Array:
+def _track(api: Connection, survey_id: str) -> Array:
     rows = api.call("GET", f"/v1/surveys/{survey_id}/samples", params={"limit": TRACK_SAMPLES}).json()["rows"]
     return np.array(rows, dtype=np.float64)[:, 1:3]
 
 
-def _true_error_uT(api: Api, world: World, index: int, map_id: str) -> tuple[Array | None, Array | None]:
+def _true_error_uT(api: Connection, world: World, index: int, map_id: str) -> tuple[Array | None, Array | None]:
     """Map less truth and stated sd at the floor's probes, each (m, 3), for a vector map of a known field."""
     if world.field_uT is None:
         return None, None
