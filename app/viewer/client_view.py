@@ -9,27 +9,25 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from app.errors import IsodynError
 from app.field.grid import FieldGrid
-from app.geometry import Array
 from app.viewer import scene as draw
-from app.viewer.layers import LAYERS, ColourScale, colour_scale, layer_names, layer_values, legend_html
+from app.viewer.floor_scene import DrawnFloor, ShownFloor, describe_floors, draw_floor, shared_scales
+from app.viewer.layers import LAYERS, layer_names, legend_html
 from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
 
 if TYPE_CHECKING:
-    from viser import ClientHandle, FrameHandle, GuiEvent
+    from viser import ClientHandle, GuiEvent
 
     from app.viewer.content import OrganisationContent
 
 __all__ = ["ClientView", "Link"]
 
 _ALL_FLOORS = "All floors"
-_OUTLINE_RGB = (190, 200, 210)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +38,6 @@ class Link:
     floor_id: str | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ShownFloor:
-    """A floor with what is drawn of it; `values` is the chosen layer, NaN where unmeasured."""
-
-    floor: ViewedFloor
-    walks: list[Walk]
-    grid: FieldGrid | None = None
-    values: Array | None = None
-    height_index: int = 0
-
-
 class ClientView:
     """Builds the controls of one client, and its scene whenever a control changes. Thread-safe."""
 
@@ -59,8 +46,7 @@ class ClientView:
         self._content = content
         self._lock = threading.RLock()
         self._buildings = content.buildings()
-        self._frames: list[FrameHandle] = []
-        self._nodes: dict[str, list[Any]] = {"arrows": [], "walks": [], "outline": []}
+        self._floors: list[DrawnFloor] = []
         self._grids: list[FieldGrid] = []
         self._walks: dict[str, list[Walk]] = {}
         self._drawn: tuple[object, ...] = ()
@@ -85,7 +71,7 @@ class ClientView:
         self._layer = gui.add_dropdown("Layer", [LAYERS["norm"].title])
         self._height = gui.add_dropdown("Height", ["lowest"], visible=False)
         self._legend = gui.add_html("")
-        self._summary = gui.add_markdown("")
+        self._summary = gui.add_html("")
         with gui.add_folder("Show"):
             shown = {
                 "arrows": gui.add_checkbox("Field arrows", True),
@@ -93,13 +79,14 @@ class ClientView:
                 "outline": gui.add_checkbox("Floor outline", True),
             }
             self._spacing = gui.add_slider(
-                "Arrow spacing", 0.5, 10.0, 0.25, 1.0, hint="Metres between field arrows; fewer are drawn when needed."
+                "Arrow spacing", 0.5, 25.0, 0.25, 1.0, hint="Metres between field arrows; fewer are drawn when needed."
             )
             self._explode = gui.add_slider("Pull apart", 0.0, 40.0, 0.5, 0.0, hint="Metres added between floors.")
         views = gui.add_button_group("View", ["Oblique", "From above"])
         self._shown = shown
         self._building.on_update(lambda event: self._safely(event, self._on_building))
-        for control in (self._floor, self._layer, self._height, self._spacing):
+        self._floor.on_update(lambda event: self._safely(event, lambda: self._redraw_when_changed(move_camera=True)))
+        for control in (self._layer, self._height, self._spacing):
             control.on_update(lambda event: self._safely(event, self._redraw_when_changed))
         for box in shown.values():
             box.on_update(lambda event: self._safely(event, self._apply_visibility))
@@ -123,13 +110,19 @@ class ClientView:
         self._choose_building()
         self._redraw(move_camera=True)
 
-    def _redraw_when_changed(self) -> None:
+    def _redraw_when_changed(self, move_camera: bool = False) -> None:
         """Redraw unless the choice is the one drawn: events queue up while a slider is dragged."""
         if self._choice() != self._drawn:
-            self._redraw()
+            self._redraw(move_camera)
 
     def _choice(self) -> tuple[object, ...]:
         return tuple(c.value for c in (self._building, self._floor, self._layer, self._height, self._spacing))
+
+    def _spacing_m(self) -> float:
+        return float(np.clip(np.nan_to_num(self._spacing.value), 0.1, 100.0))
+
+    def _separation_m(self) -> float:
+        return float(np.clip(np.nan_to_num(self._explode.value), 0.0, 100.0))
 
     def _current_building(self) -> ViewedBuilding:
         """The chosen building: always one of this organisation's, whatever name the browser sends."""
@@ -161,9 +154,8 @@ class ClientView:
                 self._walks[floor.id] = self._content.walks(floor.id)
         self._grids = list(grids.values())
         layer, height_index = self._offer_layers_and_heights()
-        shown = [self._shown_floor(f, grids.get(f.id), self._walks[f.id], layer, height_index) for f in floors]
-        scale = colour_scale(layer, [s.values for s in shown if s.values is not None])
-        norms = [layer_values(s.grid, "norm", s.height_index) for s in shown if s.grid is not None]
+        shown = [ShownFloor.of(f, self._walks[f.id], grids.get(f.id), layer, height_index) for f in floors]
+        scale, norm_scale = shared_scales(shown, layer)
         rings = [ring for f in floors for ring in f.rings_m]
         self._origin_m = draw.local_origin_m(self._grids, rings, [w for s in shown for w in s.walks])
         if move_camera and self._grids:
@@ -171,17 +163,19 @@ class ClientView:
             _assign(self._explode, draw.suggested_separation_m(self._grids))
         with self._client.atomic():
             self._client.scene.reset()
-            self._frames = []
-            self._nodes = {kind: [] for kind in self._nodes}
             slab_m = min((f.elevation_m for f in floors), default=0.0)
             draw.draw_ground(self._client.scene, "/ground", self._grids, self._origin_m, slab_m - 0.02)
-            for rank, shown_floor in enumerate(shown):
-                self._draw_floor(rank, shown_floor, scale, colour_scale("norm", norms))
+            self._floors = [
+                draw_floor(
+                    self._client.scene, f"/floor {k}", floor, scale, norm_scale, self._origin_m, self._spacing_m()
+                )
+                for k, floor in enumerate(shown)
+            ]
             self._apply_visibility()
             self._apply_explosion()
         self._drawn = self._choice()
         self._legend.content = f'<div style="padding:0 0.6em">{legend_html(layer, scale)}</div>' if grids else ""
-        self._summary.content = self._describe(shown, layer)
+        self._summary.content = describe_floors(shown, layer)
         if move_camera:
             self._move_camera()
 
@@ -203,80 +197,24 @@ class ClientView:
         self._height.visible = len(heights) > 1
         return layer, heights.index(self._height.value) if self._height.value in heights else 0
 
-    @staticmethod
-    def _shown_floor(
-        floor: ViewedFloor, grid: FieldGrid | None, walks: list[Walk], layer: str, height_index: int
-    ) -> _ShownFloor:
-        if grid is None:
-            return _ShownFloor(floor, walks)
-        k = min(height_index, len(grid.heights_m) - 1)
-        return _ShownFloor(floor, walks, grid, layer_values(grid, layer, k), k)
-
-    def _draw_floor(self, rank: int, shown: _ShownFloor, scale: ColourScale, norm_scale: ColourScale) -> None:
-        scene, base = self._client.scene, f"/floor {rank}"
-        self._frames.append(scene.add_frame(base, show_axes=False))
-        outline = draw.ring_segments(shown.floor.rings_m, shown.floor.elevation_m, self._origin_m)
-        if len(outline):
-            self._nodes["outline"].append(draw.draw_lines(scene, f"{base}/outline", outline, _OUTLINE_RGB, 2.0))
-        segments, colours = draw.walk_segments(shown.walks, self._origin_m)
-        if len(segments):
-            self._nodes["walks"].append(draw.draw_lines(scene, f"{base}/walks", segments, colours, 2.0))
-        label = shown.floor.name if shown.grid is not None else f"{shown.floor.name}: no map yet"
-        scene.add_label(f"{base}/label", label, position=self._label_position(shown), anchor="bottom-right")
-        if shown.grid is None or shown.values is None:
-            return
-        picture = draw.surface(shown.grid, shown.values, scale, self._origin_m, shown.height_index)
-        draw.draw_surface(scene, f"{base}/layer", picture)
-        arrows = draw.field_arrows(shown.grid, self._origin_m, float(self._spacing.value), shown.height_index)
-        if len(arrows.ends_m):
-            self._nodes["arrows"].append(draw.draw_arrows(scene, f"{base}/arrows", arrows, norm_scale))
-
-    def _label_position(self, shown: _ShownFloor) -> tuple[float, float, float]:
-        """The north-west corner of the floor, local metres."""
-        if shown.floor.rings_m:
-            ring = shown.floor.rings_m[0]
-            x, y = float(ring[:, 0].min()), float(ring[:, 1].max())
-        else:
-            grid = shown.grid if shown.grid is not None else next(iter(self._grids), None)
-            x, y = (0.0, 0.0) if grid is None else (grid.bounds_m[0], grid.bounds_m[4])
-        x0, y0, z0 = self._origin_m
-        return float(x - x0), float(y - y0), float(shown.floor.elevation_m - z0)
-
     def _apply_visibility(self) -> None:
-        for kind, nodes in self._nodes.items():
-            for node in nodes:
+        for floor in self._floors:
+            for kind, node in floor.nodes.items():
                 node.visible = bool(self._shown[kind].value)
 
     def _apply_explosion(self) -> None:
-        for rank, frame in enumerate(self._frames):
-            frame.position = (0.0, 0.0, rank * float(self._explode.value))
+        for rank, floor in enumerate(self._floors):
+            floor.frame.position = (0.0, 0.0, rank * self._separation_m())
 
     def _move_camera(self, top: bool = False) -> None:
         highest_map_m = max((float(grid.heights_m[-1]) for grid in self._grids), default=0.0)
         highest_m = max([highest_map_m, *(floor.elevation_m for floor in self._current_floors())])
-        spread_m = float(self._explode.value) * max(len(self._frames) - 1, 0) + highest_m - highest_map_m
+        spread_m = self._separation_m() * max(len(self._floors) - 1, 0) + highest_m - highest_map_m
         position, target = draw.camera_pose(self._grids, self._origin_m, top, spread_m)
         camera = self._client.camera
         with self._client.atomic():
             camera.position = position
             camera.look_at = target
-
-    def _describe(self, shown: list[_ShownFloor], layer: str) -> str:
-        """The picture in words and numbers, one line a floor."""
-        unit, lines = LAYERS[layer].unit, []
-        for s in shown:
-            name = escape(s.floor.name)
-            if s.grid is None or s.values is None or not np.isfinite(s.values).any():
-                lines.append(f"**{name}** no map yet, {_walks(len(s.walks))}")
-                continue
-            low, middle, high = np.nanpercentile(s.values, [5.0, 50.0, 95.0])
-            area_m2 = np.isfinite(s.values).sum() * s.grid.resolution_m**2
-            lines.append(
-                f"**{name}** median {middle:.3g} {unit}, 90 % in {low:.3g} to {high:.3g}; "
-                f"{area_m2:,.0f} m² measured, {_walks(len(s.walks))}"
-            )
-        squares = f"Ground squares are {draw.ground_cell_m(self._grids):g} m."
-        return "\n\n".join([*lines, squares])
 
 
 def _assign(control: Any, value: object) -> None:
@@ -284,15 +222,13 @@ def _assign(control: Any, value: object) -> None:
     control.value = value
 
 
-def _walks(count: int) -> str:
-    return f"{count} walk" if count == 1 else f"{count} walks"
-
-
 def _distinct(names: list[str]) -> list[str]:
     """The names with a number where one occurs again: a dropdown tells its options apart by their text."""
-    seen: dict[str, int] = {}
-    result = []
+    result: list[str] = []
     for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        result.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+        candidate, number = name, 1
+        while candidate in (*result, _ALL_FLOORS):
+            number += 1
+            candidate = f"{name} ({number})"
+        result.append(candidate)
     return result

@@ -49,7 +49,6 @@ MAX_POINTS = 300_000
 MAX_ARROWS = 20_000
 _MAX_WALK_SEGMENTS = 60_000
 _USUAL_ARROWS = 320
-_LIGHT_COMPENSATION = 0.62  # viser's default lights brighten a lit shape about threefold
 _CLEARANCE_M = 0.04  # lifts lines and arrows off the plane they would otherwise flicker against
 
 # Okabe and Ito's colours that stand out from viridis: distinguishable with every common colour vision.
@@ -100,7 +99,7 @@ def camera_pose(
     width, depth, height = high - low
     if top:
         return target + np.array([0.0, -1e-3, 0.85 * max(width, depth, 2.0) + height / 2]), target
-    reach = max(float(np.hypot(width, depth)), 2.0) * 0.62 + 0.45 * height
+    reach = max(float(np.hypot(width, depth)), 2.0) * 0.57 + 0.45 * height
     slant = np.array([-0.12, -0.8, 0.8]) if height < 0.2 * depth else np.array([-0.2, -1.0, 0.55])
     return target + reach * slant / np.linalg.norm(slant) * 1.25, target
 
@@ -141,7 +140,7 @@ def suggested_separation_m(grids: Sequence[FieldGrid]) -> float:
     bounds = np.array([grid.bounds_m for grid in grids])
     depth = float(bounds[:, 4].max() - bounds[:, 1].min())
     gap = (heights[-1] - heights[0]) / (len(heights) - 1)
-    return float(np.clip(np.round(2.0 * (0.8 * depth - gap)) / 2.0, 0.0, 40.0))
+    return float(np.clip(np.round(2.0 * (0.95 * depth - gap)) / 2.0, 0.0, 40.0))
 
 
 def field_arrows(grid: FieldGrid, origin_m: Array, spacing_m: float, height_index: int = 0) -> Arrows:
@@ -204,10 +203,10 @@ def draw_surface(scene: SceneApi, name: str, picture: Surface, visible: bool = T
 def draw_arrows(scene: SceneApi, name: str, arrows: Arrows, scale: ColourScale, visible: bool = True) -> ArrowsHandle:
     """Put arrows into the scene in the colour of |B|, lightened so that they stand off a surface of that colour."""
     thickness = arrows.spacing_m
-    tint = 0.55 * scale.rgb(arrows.magnitude_uT) + 0.45 * 255.0
-    dimmed = (_LIGHT_COMPENSATION * tint).astype(np.uint8)
+    tint = 0.7 * scale.rgb(arrows.magnitude_uT) / 255.0 + 0.3
+    linear = np.round(255.0 * tint**2.2).astype(np.uint8)  # viser 1.1 takes instance colours as linear light
     return scene.add_arrows(
-        name, arrows.ends_m, dimmed, shaft_radius=0.04 * thickness,
+        name, arrows.ends_m, linear, shaft_radius=0.04 * thickness,
         head_radius=0.12 * thickness, head_length=0.35 * thickness, visible=visible,
     )  # fmt: skip
 

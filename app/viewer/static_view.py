@@ -10,6 +10,7 @@ import numpy as np
 
 from app.field.grid import FieldGrid
 from app.geometry import Array
+from app.viewer.floor_scene import OUTLINE_RGB
 from app.viewer.layers import LAYERS, ColourScale, colour_scale, layer_names, layer_values, legend_html
 from app.viewer.scene import (
     camera_pose,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["static_view_html"]
 
-_OUTLINE_RGB = (190, 200, 210)
+_LAYER_GAP_M = 0.004  # so that of two layers switched on the later one covers the other
 # The file holds everything it needs; this makes the browser refuse anything else.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
@@ -69,8 +70,9 @@ def static_view_html(
     server = start_viser()
     try:
         origin = local_origin_m([grid], rings_m, walks)
-        for layer in names:
-            picture = surface(grid, values[layer], scales[layer], origin, height_index)
+        for rank, layer in enumerate(names):
+            above = origin - np.array([0.0, 0.0, rank * _LAYER_GAP_M])
+            picture = surface(grid, values[layer], scales[layer], above, height_index)
             draw_surface(server.scene, f"/{_node_name(layer)}", picture, visible=layer == "norm")
         _draw_lines_and_arrows(server, grid, walks, rings_m, elevation_m, origin, scales["norm"], height_index)
         server.initial_camera.position, server.initial_camera.look_at = camera_pose([grid], origin)
@@ -100,7 +102,7 @@ def _draw_lines_and_arrows(
     draw_ground(server.scene, "/Ground", [grid], origin_m, slab - 0.02)
     outline = ring_segments(rings_m, slab, origin_m)
     if len(outline):
-        draw_lines(server.scene, "/Floor outline", outline, _OUTLINE_RGB, 2.0)
+        draw_lines(server.scene, "/Floor outline", outline, OUTLINE_RGB, 2.0)
 
 
 def _node_name(layer: str) -> str:

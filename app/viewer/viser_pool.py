@@ -13,7 +13,7 @@ import logging
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlencode, urlsplit
 
@@ -41,7 +41,6 @@ class OrganisationViewer:
     secret: str
     visitors: int = 0
     idle_since: float = 0.0
-    views: dict[int, ClientView] = field(default_factory=dict)
 
     @property
     def http_url(self) -> str:
@@ -130,16 +129,12 @@ class ViserPool:
             link = _link_of(client, viewer)
             if link is not None:
                 try:
-                    viewer.views[client.client_id] = ClientView(client, content, link)
+                    ClientView(client, content, link)  # its controls keep it alive as long as the client
                 except Exception:
                     _log.exception("a page could not be built for organisation %s", organisation_id)
                     client.add_notification("This page could not be built", "The server's log says why.", color="red")
 
-        def farewell(client: ClientHandle) -> None:
-            viewer.views.pop(client.client_id, None)
-
         viewer.server.on_client_connect(welcome)
-        viewer.server.on_client_disconnect(farewell)
         return viewer
 
 

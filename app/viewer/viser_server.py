@@ -36,10 +36,19 @@ def start_viser() -> ViserServer:
     with _quiet_console():
         server = LoopbackServer(host=LOOPBACK, port=0, verbose=False)
     server.scene.world_axes.visible = False
+    _light(server)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(33, 145, 140))
     server.gui.main_panel.dock_right()
     server.gui.set_panel_label("Isodyn")
     return server
+
+
+def _light(server: ViserServer) -> None:
+    """An even light and a weak one from above: arrows keep the colours they are given, which viser's own bleach."""
+    server.scene.configure_default_lights(enabled=False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_ambient("/light", intensity=2.6)
+    server.scene.add_light_directional("/light/above", intensity=1.6, position=(4.0, -6.0, 10.0))
 
 
 def stop_viser(server: ViserServer) -> None:

@@ -1,6 +1,7 @@
 """What passes between a browser and its viser server, and what does not."""
 
 import time
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -9,6 +10,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from app.viewer.heatmap import heatmap_png
 from app.viewer.page import ViewerApp
 from app.viewer.proxy import CLOSE_SIGNED_OUT, CLOSE_UNREACHABLE, passes
 
@@ -101,6 +103,25 @@ def test_an_organisation_never_sees_anothers_objects(running, open_page):
     assert "Tower" not in seen["south-key"]
     servers = running.viewer.pool.running()
     assert servers["north"].server is not servers["south"].server
+
+
+def test_names_are_text_whatever_they_say(running, source, open_page, tmp_path):
+    """viser would read a picture named in Markdown from the server's disk."""
+    picture = tmp_path / "secret.png"
+    picture.write_bytes(heatmap_png(source.grids["map-0"]))
+    tower = source.by_organisation["north"][0]
+    name = f"![x]({picture}) <script>alert(1)</script>"
+    floors = (replace(tower.floors[0], name=name), replace(tower.floors[1], name=name))
+    source.by_organisation["north"] = [replace(tower, name=name, floors=floors)]
+    with running.websocket(running.cookie("north-key")) as socket:
+        page = open_page(socket)
+        page.read_until(lambda p: len(p.labels()) == 2)
+        page.read_for(0.5)
+    assert page.control("Building")["props"]["options"] == [name]
+    texts = [m["updates"]["content"] for m in page.of_type("GuiUpdateMessage") if "content" in m["updates"]]
+    assert any(f"![x]({picture}) &lt;script&gt;" in text for text in texts)
+    assert "data:image" not in repr(page.messages)
+    assert "<script>" not in "".join(texts)
 
 
 def test_share_requests_never_reach_viser(running, open_page):
