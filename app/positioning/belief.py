@@ -7,8 +7,9 @@ import numpy as np
 from app.geometry import Array
 from app.positioning.fix import LocateOptions
 from app.positioning.lattice import turn_window
+from app.positioning.likelihood import window_likelihood
 from app.positioning.matching import Matched
-from app.positioning.posterior import Atoms, cell_atoms, find_modes, replace_narrow_mode
+from app.positioning.posterior import Atoms, cell_atoms, find_modes, replace_narrow_mode, untold_variance_m2
 from app.positioning.refine import Refined, refine_poses
 
 __all__ = ["Belief", "BelievedMode", "believe"]
@@ -33,17 +34,19 @@ class BelievedMode:
 class Belief:
     """atoms: normalised mass over places. modes: strongest first. best: the mode of the most likely pose, refined.
 
-    lattice_mass                 (n,) share of each candidate pose, as the techniques take them
-    off_map, half_measured, missed    probabilities: nothing mapped where the window was walked; fewer than half of
-                                 the window on measured cells; at most this much left out by the search
+    lattice_mass   (n,) share of each candidate pose, as the techniques take them
+    unmapped       probability that nothing is mapped where the window was walked, or less than half of it
+    off_map_distance2, off_map_scalars    how well the prior field explains the window: a chi-square and its freedom
+    missed         at most this probability was left out by the search
     """
 
     atoms: Atoms
     modes: tuple[BelievedMode, ...]
     best: BelievedMode
     lattice_mass: Array
-    off_map: float
-    half_measured: float
+    unmapped: float
+    off_map_distance2: float
+    off_map_scalars: float
     missed: float
 
 
@@ -52,7 +55,8 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
     found = matched.candidates
     relative = np.exp((found.score - found.score[0]) / matched.temper)
     cell = np.array([plane.resolution_m for plane in matched.planes])
-    atoms = cell_atoms(found.plane, found.row, found.column, matched.position_m, relative, cell[found.plane])
+    untold = untold_variance_m2(matched.window.from_last_m)
+    atoms = cell_atoms(found.plane, found.row, found.column, matched.position_m, relative, cell[found.plane], untold)
     members = find_modes(found.plane, matched.position_m, found.score, options.mlr_min_distance_m, _MODES)
     peaks = [int(group[0]) for group in members]
     refined = [_refine(matched, peak) for peak in peaks]
@@ -60,7 +64,7 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
         plane = int(found.plane[peak])
         mass = _laplace_mass(matched, plane, fine)
         atoms = replace_narrow_mode(
-            atoms, plane, fine.pose[0, :2], fine.covariance[0, :2, :2], mass, float(cell[plane])
+            atoms, plane, fine.pose[0, :2], fine.covariance[0, :2, :2], mass, float(cell[plane]), untold
         )
     total = float(atoms.mass.sum())
     share = _mode_masses(atoms, [(int(found.plane[k]), r.pose[0, :2]) for k, r in zip(peaks, refined, strict=True)],
@@ -69,15 +73,17 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
         BelievedMode(int(found.plane[k]), r.pose[0], float(r.log_l[0]), float(r.distance2[0]), float(s))
         for k, r, s in zip(peaks, refined, share, strict=True)
     ]
-    off_map = _off_map_mass(matched)
+    off_map = _off_map(matched)
+    nowhere, poor = off_map.mass / (off_map.mass + total), _poorly_measured(matched, relative)
     atoms.mass = atoms.mass / total
     return Belief(
         atoms=atoms,
         modes=tuple(sorted(modes, key=lambda mode: -mode.probability)),
         best=modes[0],
         lattice_mass=relative / relative.sum(),
-        off_map=off_map / (off_map + total),
-        half_measured=_poorly_measured(matched, relative),
+        unmapped=nowhere + (1.0 - nowhere) * poor,
+        off_map_distance2=off_map.distance2,
+        off_map_scalars=off_map.scalars,
         missed=found.missed_mass / (found.missed_mass + total),
     )
 
@@ -123,22 +129,34 @@ def _mode_masses(atoms: Atoms, centres: list[tuple[int, Array]], reach_m: float)
     return np.asarray(np.bincount(nearest[near], weights=atoms.mass[near], minlength=len(centres)), dtype=np.float64)
 
 
-def _off_map_mass(matched: Matched) -> float:
-    """Mass of "none of this is mapped", in the same units: the window against the prior field, headings averaged."""
+@dataclass(frozen=True, slots=True)
+class _OffMap:
+    """The hypothesis that none of this is mapped: its mass in units of the best pose's, and how the prior field fits.
+
+    `distance2` is of the best heading, scaled to the `scalars` independent numbers that so smooth a field has to offer.
+    """
+
+    mass: float
+    distance2: float
+    scalars: float
+
+
+def _off_map(matched: Matched) -> _OffMap:
     plane, window = matched.planes[int(matched.candidates.plane[0])], matched.window
     turned = turn_window(window, matched.headings_rad, plane.resolution_m)
     variance = plane.off_map_variance_uT2 + window.noise_variance_uT2[:, None]
-    residual = turned.features_uT - plane.ambient_uT
-    weight = 1.0 / variance
-    log_l = -0.5 * np.full(len(residual), np.log(2 * np.pi * variance).sum())
-    if matched.demeaned:
-        residual = residual - (weight * residual).sum(axis=1, keepdims=True) / weight.sum(axis=0)
-        log_l += 0.5 * np.log(2 * np.pi / weight.sum(axis=0)).sum()
-    log_l -= 0.5 * np.sum(weight * residual**2, axis=(1, 2))
+    fit = window_likelihood(turned.features_uT - plane.ambient_uT, variance, matched.demeaned)
     heading = np.exp(matched.pose_prior.heading_log)
-    relative = np.exp(np.clip((log_l - matched.candidates.score[0]) / matched.temper, -700, 700))
+    relative = np.exp(np.clip((fit.log_l - matched.candidates.score[0]) / matched.temper, -700, 700))
     odds = OFF_MAP_PRIOR / (1.0 - OFF_MAP_PRIOR)
-    return float(odds * matched.prior_mass * (heading @ relative) / heading.sum())
+    smooth_m = float(np.sqrt(2.0 * plane.off_map_variance_uT2.sum())) / max(plane.gradient_uT_per_m, 1e-6)
+    n, c = window.features_uT.shape
+    independent = min(float(n), 1.0 + float(window.path_m[-1] - window.path_m[0]) / (2.0 * smooth_m))
+    return _OffMap(
+        mass=float(odds * matched.prior_mass * (heading @ relative) / heading.sum()),
+        distance2=float(fit.distance2.min()) * independent / n,
+        scalars=independent * c,
+    )
 
 
 def _poorly_measured(matched: Matched, relative: Array) -> float:

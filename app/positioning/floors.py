@@ -60,8 +60,8 @@ class SearchableFloor:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held beside the grid itself: about 150 per cell and three components."""
-        return sum(plane.nbytes for plane in self.planes)
+        """Bytes held, the grid's included: about 150 per cell with three components."""
+        return self.grid.nbytes + sum(plane.nbytes for plane in self.planes)
 
 
 def prepare_floor(floor_id: str, grid: FieldGrid) -> SearchableFloor:

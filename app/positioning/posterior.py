@@ -2,7 +2,7 @@
 
 The atoms are the searched poses, each spread over its cell. Where a mode is narrower than a cell the lattice cannot
 resolve it: there the refined Gaussian takes the place of the poses around it, with its Laplace mass. Every atom is
-widened by a floor of position error that no map or label can go below.
+widened by what no match can tell: errors of map coordinates, and of the distance from the window's middle to its end.
 """
 
 from collections.abc import Sequence
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from app.geometry import Array
 
 __all__ = [
-    "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius", "mixture_points", "replace_narrow_mode",
+    "DISPLACEMENT_SCALE_SD", "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius",
+    "mixture_points", "replace_narrow_mode", "untold_variance_m2",
 ]  # fmt: skip
 
-POSITION_SD_FLOOR_M = 0.05
+POSITION_SD_FLOOR_M = 0.03  # of the map's coordinates
+DISPLACEMENT_SCALE_SD = 0.02  # of a window's displacements
 _RINGS, _SPOKES = 24, 12
 _MANY = 4000
 
@@ -33,6 +35,12 @@ class Atoms:
 
     def on(self, chosen: NDArray[np.bool_]) -> "Atoms":
         return Atoms(self.plane[chosen], self.position_m[chosen], self.mass[chosen], self.covariance_m2[chosen])
+
+
+def untold_variance_m2(from_last_m: Array) -> float:
+    """Variance per axis of the last position that matching leaves, from the samples' positions (n, 2) from the last."""
+    lever = float(np.linalg.norm(from_last_m.mean(axis=0)))
+    return POSITION_SD_FLOOR_M**2 + (DISPLACEMENT_SCALE_SD * lever) ** 2
 
 
 def find_modes(
@@ -56,7 +64,13 @@ def find_modes(
 
 
 def replace_narrow_mode(
-    atoms: Atoms, plane: int, position_m: Array, covariance_m2: Array, laplace_mass: float, cell_m: float
+    atoms: Atoms,
+    plane: int,
+    position_m: Array,
+    covariance_m2: Array,
+    laplace_mass: float,
+    cell_m: float,
+    untold_m2: float,
 ) -> Atoms:
     """Exchange the atoms around a mode narrower than a cell for its Gaussian; wider modes stay as they are."""
     widest = float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]))
@@ -66,12 +80,11 @@ def replace_narrow_mode(
         np.linalg.norm(atoms.position_m - position_m, axis=1) < 3.0 * widest + 1.5 * cell_m
     )
     kept = atoms.on(~near)
-    floor = POSITION_SD_FLOOR_M**2 * np.eye(2)
     return Atoms(
         np.append(kept.plane, plane),
         np.vstack([kept.position_m, position_m]),
         np.append(kept.mass, laplace_mass),
-        np.concatenate([kept.covariance_m2, (covariance_m2 + floor)[None]]),
+        np.concatenate([kept.covariance_m2, (covariance_m2 + untold_m2 * np.eye(2))[None]]),
     )
 
 
@@ -97,12 +110,13 @@ def cell_atoms(
     position_m: Array,
     mass: Array,
     cell_m: Array,
+    untold_m2: float,
 ) -> Atoms:
     """Atoms of the cells that poses (n,) fall in, headings summed, each spread over its cell (side `cell_m` (n,))."""
     key = np.stack([plane, row, column], axis=1)
     _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
     total = np.asarray(np.bincount(group.ravel(), weights=mass), dtype=np.float64)
-    spread = np.square(cell_m[first]) / 12.0 + POSITION_SD_FLOOR_M**2
+    spread = np.square(cell_m[first]) / 12.0 + untold_m2
     return Atoms(plane[first], position_m[first], total, spread[:, None, None] * np.eye(2))
 
 

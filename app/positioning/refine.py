@@ -13,6 +13,7 @@ from app.geometry import Array
 from app.positioning.features import field_jacobian, reduce_field, reduce_variance
 from app.positioning.floors import Plane, SearchableFloor
 from app.positioning.lattice import ReducedWindow
+from app.positioning.likelihood import window_likelihood
 
 __all__ = ["PoseGaussian", "Refined", "refine_poses"]
 
@@ -96,20 +97,16 @@ def _linearise(
 ) -> _Linearised:
     residual, variance, jacobian = _residuals(floor, plane, window, pose)
     weight = 1.0 / variance
-    log_l = -0.5 * np.sum(np.log(2 * np.pi * variance), axis=(1, 2))
+    fit = window_likelihood(residual, variance, demeaned)
     if demeaned:
-        total = weight.sum(axis=1, keepdims=True)
-        residual = residual - (weight * residual).sum(axis=1, keepdims=True) / total
-        jacobian = jacobian - np.sum(weight[..., None] * jacobian, axis=1, keepdims=True) / total[..., None]
-        log_l += 0.5 * np.sum(np.log(2 * np.pi / total), axis=(1, 2))
-    distance2 = np.sum(weight * residual**2, axis=(1, 2))
-    log_l -= 0.5 * distance2
+        shares = (weight / weight.sum(axis=1, keepdims=True))[..., None]
+        jacobian = jacobian - np.sum(shares * jacobian, axis=1, keepdims=True)
     off = pose - prior.mean
     off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
-    gradient = np.einsum("mnc,mnc,mncp->mp", weight, residual, jacobian) - temper * prior.precision * off
+    gradient = np.einsum("mnc,mnc,mncp->mp", weight, fit.residual, jacobian) - temper * prior.precision * off
     information = np.einsum("mnc,mncp,mncq->mpq", weight, jacobian, jacobian) + temper * np.diag(prior.precision)
-    objective = log_l - 0.5 * temper * np.sum(prior.precision * off**2, axis=1)
-    return _Linearised(log_l, objective, distance2, gradient, information)
+    objective = fit.log_l - 0.5 * temper * np.sum(prior.precision * off**2, axis=1)
+    return _Linearised(fit.log_l, objective, fit.distance2, gradient, information)
 
 
 def _residuals(floor: SearchableFloor, plane: Plane, window: ReducedWindow, pose: Array) -> tuple[Array, Array, Array]:

@@ -13,8 +13,7 @@ from scipy.stats import chi2
 from app.geometry import Array
 
 __all__ = [
-    "ABL_UNIFORM_MULTIPLE", "Bin", "Rival", "best_bin", "chi_square_limit", "likelihood_rival", "log_likelihood",
-    "peak_over_uniform", "section_residuals",
+    "ABL_UNIFORM_MULTIPLE", "Bin", "Rival", "best_bin", "chi_square_limit", "likelihood_rival", "peak_over_uniform",
 ]  # fmt: skip
 
 ABL_UNIFORM_MULTIPLE = 100.0  # ABL answers when the likeliest cell holds this many times the uniform mass
@@ -33,17 +32,6 @@ class Bin(NamedTuple):
     mass: float
     row: float
     column: float
-
-
-def log_likelihood(z_uT: Array, map_uT: Array, sd_uT: Array | float) -> Array:
-    """Log-likelihood without its constant of a measurement (..., N) at each map row (..., N) (Shockley 7.2, L754)."""
-    return np.asarray(-0.5 * np.sum(np.square((z_uT - map_uT) / sd_uT), axis=-1))
-
-
-def section_residuals(section_uT: Array, map_uT: Array, demeaned: bool = False) -> Array:
-    """Residuals (n, c) of a section against a map section, less their means when demeaned (Shockley 8.6)."""
-    residuals = section_uT - map_uT
-    return np.asarray(residuals - residuals.mean(axis=0)) if demeaned else residuals
 
 
 def likelihood_rival(

@@ -65,19 +65,19 @@ def _mlr(matched: Matched, belief: Belief, options: LocateOptions) -> MlrEstimat
 def _abl(matched: Matched, belief: Belief, options: LocateOptions) -> AblEstimate:
     found, mass = matched.candidates, belief.lattice_mass
     strongest, winner, lead = None, 0, -1.0
-    peak, cells = 0.0, sum(plane.shape[0] * plane.shape[1] for plane in matched.planes)
+    tables, cells = [], sum(plane.shape[0] * plane.shape[1] for plane in matched.planes)
     for k in np.unique(found.plane):
         here, plane = found.plane == k, matched.planes[k]
         row0, column0 = found.row[here].min(), found.column[here].min()
         table = np.zeros((found.row[here].max() - row0 + 1, found.column[here].max() - column0 + 1))
         np.add.at(table, (found.row[here] - row0, found.column[here] - column0), mass[here])
-        peak = max(peak, float(table.max()))
+        tables.append(table.ravel())
         held = best_bin(table, max(round(options.abl_bin_m / plane.resolution_m), 1))
         if held.mass > lead:
             lead, winner = held.mass, int(k)
             strongest = (column0 + held.column, row0 + held.row)
     threshold = ABL_UNIFORM_MULTIPLE if options.abl_threshold is None else options.abl_threshold
-    multiple = peak_over_uniform(np.array([peak, 1.0 - peak]), cells)
+    multiple = peak_over_uniform(np.concatenate(tables), cells)
     if multiple < threshold or strongest is None:
         reason = f"the likelihood is spread out: its peak is {multiple:.3g} times the uniform share, not {threshold:g}"
         return AblEstimate(False, lead, reason=reason)
@@ -110,21 +110,21 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
             )
             for mode in belief.modes
         ),
-        off_map_probability=belief.off_map,
+        off_map_probability=belief.unmapped,
         missed_probability=belief.missed,
     )  # fmt: skip
 
 
 def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[Status, str | None]:
-    unmapped = belief.off_map + (1.0 - belief.off_map) * belief.half_measured
-    if unmapped > 0.5:
-        return "unmapped", (
-            f"the window fits ground without a map at least as well (probability {unmapped:.2f}); walk on into mapped "
-            "corridors, or survey where this was recorded"
-        )
     scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if matched.demeaned else 0)
     distance2 = belief.best.distance2 / matched.temper
     limit = chi_square_limit(scalars / matched.temper, options.gate_probability)
+    unlike_any_field = belief.off_map_distance2 > chi_square_limit(belief.off_map_scalars, options.gate_probability)
+    if belief.unmapped > 0.5 and not (unlike_any_field and distance2 > limit):
+        return "unmapped", (
+            f"the window fits ground without a map at least as well (probability {belief.unmapped:.2f}); walk on into "
+            "mapped corridors, or survey where this was recorded"
+        )
     if distance2 > limit:
         return "inconsistent", (
             f"even the best match is worse than chance allows (chi-square {distance2:.1f}, limit {limit:.1f}); check "

@@ -33,6 +33,7 @@ def make_grid(
     heights_m: tuple[float, ...] = (1.2,),
     unmapped: float = 0.0,
     error_correlation_m: float = 0.0,
+    sd_spread: float = 0.3,
 ) -> FieldGrid:
     """A smooth random field; `unmapped` is the share of cells (in patches) that were never measured."""
     c, nz = len(COMPONENT_NAMES[components]), len(heights_m)
@@ -47,7 +48,7 @@ def make_grid(
     patches = gaussian_filter(rng.normal(size=(nz, *shape)), (0, 4, 4), mode="wrap")
     measured = patches >= (np.quantile(patches, unmapped) if unmapped else -np.inf)
     prior_sd = np.full(c, max(field_sd_uT, 1.0))
-    sd = map_sd_uT * (1.0 + 0.3 * rng.random((nz, *shape, c)))
+    sd = map_sd_uT * (1.0 + sd_spread * rng.random((nz, *shape, c)))
     return FieldGrid(
         components=components,
         origin_m=origin_m,
