@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["evaluate"]
 
+_FILE_WIDTH = 130
+
 
 def evaluate(
     directory: Annotated[
@@ -31,6 +33,9 @@ def evaluate(
     resolution_m: Annotated[float, typer.Option("--resolution", min=0.1, help="cell of the maps, metres")] = 1.0,
     components: Annotated[str, typer.Option(help="vector, level or norm")] = "vector",
     composition: Annotated[str, typer.Option(help="raw or demeaned")] = "raw",
+    session_bias: Annotated[
+        bool, typer.Option(help="take out the hard iron that mapping walks show for a session")
+    ] = True,
     processes: Annotated[int, typer.Option(min=1, max=2, help="child processes")] = 2,
 ) -> None:
     """Hold one walk in five out, map the rest, locate windows of the held-out walks, and print how good that is."""
@@ -49,6 +54,7 @@ def evaluate(
         window_lengths_m=tuple(lengths_m),
         spec=MapSpec(components=components, resolution_m=resolution_m),  # type: ignore[arg-type]
         composition=composition,  # type: ignore[arg-type]
+        session_bias=session_bias,
         processes=processes,
     )
     errors = Console(stderr=True)
@@ -67,7 +73,8 @@ def evaluate(
         errors.print(f"[red]{error}[/red]")
         raise typer.Exit(1) from error
     summaries = summarise(evaluation)
-    _print(Console(), evaluation, summaries)
+    console = Console()
+    _print(console if console.is_terminal else Console(width=_FILE_WIDTH), evaluation, summaries)
     if json_file is not None:
         document = {"evaluation": asdict(evaluation), "summaries": [asdict(summary) for summary in summaries]}
         json_file.write_text(json.dumps(_finite(document), indent=1, allow_nan=False) + "\n")

@@ -10,7 +10,7 @@ import gzip
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,9 @@ from threadpoolctl import threadpool_limits
 from app.errors import Fault, InvalidInput, UnreadableSurvey
 from app.field.fit import fit_map
 from app.field.samples import Samples
+from app.field.session_bias import SessionBias, estimate_session_biases, remove_session_biases
 from app.field.spec import FittedMap, MapSpec, Score
-from app.geometry import Array
+from app.geometry import Array, rotate_by_quaternion
 from app.positioning.fix import Fix, LocateOptions
 from app.positioning.locate import SearchableFloor, locate, prepare_floor
 from app.positioning.window import Composition, Window
@@ -31,8 +32,8 @@ from app.survey.read import read_survey
 from app.survey.walk import DeadReckoning, Walk
 
 __all__ = [
-    "EvaluatedFloor", "Evaluation", "EvaluationPlan", "JudgedWindow", "Place", "cut_windows", "evaluate_walks",
-    "hold_out",
+    "EvaluatedFloor", "Evaluation", "EvaluationPlan", "JudgedWindow", "Place", "calibrate_sessions", "cut_windows",
+    "evaluate_walks", "hold_out",
 ]  # fmt: skip
 
 HELD_OUT_EVERY = 5
@@ -47,11 +48,16 @@ Told = Callable[[str, int, int], None]  # (stage, done, total)
 
 @dataclass(frozen=True, slots=True)
 class EvaluationPlan:
-    """What to evaluate: window lengths in metres walked, the map's parameters, child processes."""
+    """What to evaluate: window lengths in metres walked, the map's parameters, child processes.
+
+    session_bias   take the hard iron that the mapping walks show for a calibration session out of its walks, held-out
+                   ones included: a phone keeps its session, and its bias, from one walk to the next
+    """
 
     window_lengths_m: tuple[float, ...] = (10.0, 20.0, 40.0)
     spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0))
     composition: Composition = "raw"
+    session_bias: bool = True
     options: LocateOptions = field(default_factory=LocateOptions)
     processes: int = 2
 
@@ -112,11 +118,11 @@ class Evaluation:
 def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluation:
     """Evaluate the floors under `directory`. Raises InvalidInput when there is nothing to evaluate."""
     floors, unreadable = _read_floors(directory, told)
+    if plan.session_bias:
+        floors = {floor_id: calibrate_sessions(walks) for floor_id, walks in floors.items()}
     with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=_one_thread) as pool:
         fits = {
-            pool.submit(_fit_floor, floor_id, {name: walks[name].samples for name in hold_out(walks)[0]}, plan.spec): (
-                floor_id
-            )
+            pool.submit(_fit_floor, {name: walks[name].samples for name in hold_out(walks)[0]}, plan.spec): floor_id
             for floor_id, walks in floors.items()
         }
         fitted = dict(_collected(fits, told, "fitting maps"))
@@ -140,6 +146,25 @@ def hold_out(walks: Mapping[str, object]) -> tuple[list[str], list[str]]:
     names = sorted(walks)
     held_out = names[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
     return [name for name in names if name not in set(held_out)], held_out
+
+
+def calibrate_sessions(walks: Mapping[str, Walk]) -> dict[str, Walk]:
+    """The walks of a floor without the offset of their calibration session, as the walks to map show it."""
+    mapping, _ = hold_out(walks)
+    biases = estimate_session_biases({name: walks[name].samples for name in mapping})
+    samples = remove_session_biases({name: walk.samples for name, walk in walks.items()}, biases)
+    return {
+        name: replace(walk, samples=samples[name], dead_reckoning=_calibrated(walk, biases))
+        for name, walk in walks.items()
+    }
+
+
+def _calibrated(walk: Walk, biases: Mapping[str, SessionBias]) -> DeadReckoning | None:
+    reckoned, bias = walk.dead_reckoning, biases.get(str(walk.samples.session))
+    if reckoned is None or bias is None:
+        return reckoned
+    offset_uT = np.broadcast_to(bias.bias_body_uT, reckoned.B_level_uT.shape)
+    return replace(reckoned, B_level_uT=reckoned.B_level_uT - rotate_by_quaternion(reckoned.q_body_to_level, offset_uT))
 
 
 def cut_windows(reckoned: DeadReckoning, length_m: float) -> Iterator[tuple[slice, Window]]:
@@ -230,8 +255,8 @@ def _one_thread() -> None:
     threadpool_limits(1)
 
 
-def _fit_floor(floor_id: str, walks: Mapping[str, Samples], spec: MapSpec) -> FittedMap:
-    return fit_map({f"{floor_id}/{name}": samples for name, samples in walks.items()}, spec)
+def _fit_floor(walks: Mapping[str, Samples], spec: MapSpec) -> FittedMap:
+    return fit_map(walks, spec)
 
 
 _floors: list[SearchableFloor] = []

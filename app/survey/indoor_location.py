@@ -174,6 +174,7 @@ def _dead_reckoning(motion: Motion, B_level_uT: Array, groups: "_Groups") -> Dea
         displacement_m=_turned(displacement, np.full(groups.count, -yaw_0)),
         yaw_rad=yaw[middle] - yaw_0,
         B_level_uT=_turned(turned, -yaw[middle]),
+        q_body_to_level=attitude_quaternions(motion.level[middle], np.zeros(groups.count)),
         step_t_s=motion.steps.end_s - motion.t_s[0],
         step_length_m=motion.steps.length_m,
         heading_rad=None if motion.heading_rad is None else motion.heading_rad[middle],

@@ -17,6 +17,7 @@ class DeadReckoning:
     displacement_m          (n, 3) from the first sample, from detected steps and the gyroscope (z is 0)
     yaw_rad                 (n,) yaw of the device since the first sample, from the gyroscope
     B_level_uT              (n, 3) field in each sample's own level frame, after the device's own bias was subtracted
+    q_body_to_level         (n, 4) scalar-first attitude of the device in each sample's own level frame
     step_t_s                (k,) times at which steps ended
     step_length_m           (k,) modelled lengths of those steps
     heading_rad             (n,) yaw of each level frame in the building as the device believes it at that moment, from
@@ -28,6 +29,7 @@ class DeadReckoning:
     displacement_m: Array
     yaw_rad: Array
     B_level_uT: Array
+    q_body_to_level: Array
     step_t_s: Array
     step_length_m: Array
     heading_rad: Array | None
