@@ -90,7 +90,7 @@ def _show(console: Console, api: "Connection", world: "World", folder: Path) -> 
         answers = ask(api, building_id, world.questions, told)
     judged = reporting.judge(answers, floor_ids)
     console.print(*(f"[dim]{note}[/dim]" for note in world.notes), sep="\n")
-    console.print(reporting.map_table(floors), reporting.position_table(judged), reporting.status_line(answers))
+    console.print(reporting.map_table(floors), *reporting.position_tables(judged), reporting.status_line(answers))
     document = reporting.report(world, floors, answers, judged)
     (folder / "report.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
     _draw(console, api, folder, floors, answers, judged)
@@ -149,7 +149,11 @@ def _leave_up(console: Console, server: "DemoServer") -> None:
 
     console.print(f"\n[bold]The server is up.[/bold] Page: {server.url}/view/   API: {server.url}/docs", soft_wrap=True)
     console.print(f"Sign in with the key [bold]{server.key}[/bold]   (Ctrl-C stops the server)", soft_wrap=True)
-    code = server.process.wait()
+    try:
+        code = server.process.wait()
+    except KeyboardInterrupt:
+        console.print("stopping the server")
+        return
     raise DemoError(f"the server ended by itself with code {code}; see {server.log}")
 
 

@@ -34,6 +34,7 @@ def draw_floor(path: Path, floor: MappedFloor, answers: list[Answer]) -> None:
     norm, sd = _norm_and_sd_uT(floor)
     _show(figure, left, norm, extent, "viridis", "|B| (µT)")
     _draw_fixes(left, floor, answers)
+    _legend(figure)
     left.set_title(f"{floor.name}: mapped field, unseen walks and where they were located", fontsize=10)
     _show(figure, right, sd, extent, "cividis", "stated sd of |B| (µT)")
     for track in floor.tracks_m:
@@ -106,18 +107,17 @@ def _draw_fixes(axes: "Axes", floor: MappedFloor, answers: list[Answer]) -> None
         axes.plot([truth[0], x], [truth[1], y], color=VERMILION, lw=1.0, zorder=3)
         axes.plot(x, y, "o", color=VERMILION, mec="white", mew=0.6, ms=4, zorder=5)
         axes.add_patch(Circle((x, y), belief["radius_95_m"], fill=False, color=VERMILION, lw=1.4, zorder=6))
-    _legend(axes)
 
 
 def _floor_of(answer: Answer, floor: MappedFloor) -> bool:
     return bool(answer.question.floor == floor.index)
 
 
-def _legend(axes: "Axes") -> None:
+def _legend(figure: "Figure") -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    axes.legend(
+    figure.legend(
         handles=[
             Line2D([], [], color="white", lw=2, label="walk of the window"),
             Line2D([], [], color="black", marker="x", ls="", mew=1.8, label="truth"),
@@ -125,7 +125,7 @@ def _legend(axes: "Axes") -> None:
             Line2D([], [], color=VERMILION, marker="o", mfc="none", ms=11, ls="", label="95 % radius"),
             Patch(facecolor=_UNMAPPED, edgecolor="#808080", label="not mapped"),
         ],
-        loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, fontsize=8, facecolor="#c8c8c8", framealpha=1.0,
+        loc="outside lower center", ncols=5, fontsize=8, facecolor="#c8c8c8", framealpha=1.0,
     )  # fmt: skip
 
 
@@ -168,7 +168,7 @@ def _draw_calibration(axes: "Axes", beliefs: list[Judged]) -> None:
     axes.set(xlabel="stated 95 % radius (m)", ylabel="true error (m)")
     held = np.mean([each.error_m is not None and each.error_m <= each.radius_95_m for each in answered])
     axes.set_title(f"{held:.0%} of {len(answered)} windows within their 95 % radius", fontsize=10)
-    axes.legend(loc="upper left", fontsize=8, title="black edge at the top: wrong floor", title_fontsize=8)
+    axes.legend(loc="best", fontsize=8, title="black edge, at the top: wrong floor", title_fontsize=8)
     axes.grid(which="both", color="#d9d9d9", lw=0.4)
 
 

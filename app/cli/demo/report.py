@@ -11,7 +11,7 @@ from app.cli.demo.journey import Answer, MappedFloor
 from app.cli.demo.world import World
 from app.geometry import Array
 
-__all__ = ["TECHNIQUES", "Judged", "absurdities", "judge", "map_table", "position_table", "report", "status_line"]
+__all__ = ["TECHNIQUES", "Judged", "absurdities", "judge", "map_table", "position_tables", "report", "status_line"]
 
 TECHNIQUES = ("ml", "mlr", "abl", "posterior")
 _NAMES = {"ml": "ML", "mlr": "MLR", "abl": "ABL", "posterior": "posterior"}
@@ -67,10 +67,20 @@ def map_table(floors: list[MappedFloor]) -> Table:
     return table
 
 
-def position_table(judged: list[Judged]) -> Table:
+def position_tables(judged: list[Judged]) -> list[Table]:
+    """All windows; and, where some went off the map, those that stayed on it."""
+    on_the_map = [each for each in judged if each.answer.question.covered]
+    tables = [_position_table("Positions of windows from unseen walks: any floor, no prior", judged)]
+    if 0 < len(on_the_map) < len(judged):
+        title = "Only windows of which at least 80 % has another walk within 1.5 m"
+        tables.append(_position_table(title, on_the_map))
+    return tables
+
+
+def _position_table(title: str, judged: list[Judged]) -> Table:
     """True error against stated 95 % radius, per window length and technique."""
     table = _table(
-        "Positions of windows from unseen walks: any floor, no prior",
+        title,
         "errors: horizontal, infinite on a wrong floor; stated: median radius; held: error within it",
         ["technique", "window\nm", "asked", "answered\n%", "right\nfloor %", "error m\nmedian", "error m\n95 %",
          "stated m\n95 %", "held\n%"],
@@ -191,8 +201,8 @@ def _rms(error: Array) -> Array:
 
 
 def _quantile(errors: Array, q: float) -> float:
-    """The nearest observed value from above, so that an infinite error never mixes with a finite one."""
-    return float(np.quantile(errors, q, method="higher"))
+    """An observed value, so that an infinite error never mixes with a finite one."""
+    return float(np.quantile(errors, q, method="inverted_cdf"))
 
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:
