@@ -8,13 +8,11 @@ the others notice when its lease runs out.
 import logging
 import os
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable
 from math import ceil
 from types import FrameType
-from uuid import uuid4
 
 from dbos import DBOS, DBOSClient
 from sqlalchemy import Engine
@@ -24,14 +22,14 @@ from app.jobs.engine import QUEUE, engine_configuration, open_client
 from app.jobs.lease import Lease
 from app.settings import Settings
 from workers.builder import DEFAULT_BUILDER, load_builder
-from workers.janitor import hand_over
-from workers.reconcile import close_abandoned_jobs, has_unfinished_jobs
+from workers.lifeline import Lifeline, new_worker_id
+from workers.reaper import Reaper
+from workers.reconcile import has_unfinished_jobs
 from workers.workflows import WorkflowContext, register_workflows
 
 __all__ = ["run_worker"]
 
 POLL_S = 0.25
-LOOK_FOR_DEAD_S = 5.0
 FENCED = 3
 
 log = logging.getLogger(__name__)
@@ -57,13 +55,15 @@ def run_worker(
     client = open_client(engine)
     context = WorkflowContext(session_factory(engine), settings.resolved_blob_url, load_builder(builder), builder)
     register_workflows(context)
-    lease = Lease(engine, f"{socket.gethostname()[:60]}-{os.getpid()}-{uuid4().hex[:12]}", lease_ttl_s)
+    lease = Lease(engine, new_worker_id(), lease_ttl_s)
+    lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)
     _launch(engine, lease.worker_id, settings.worker_processes)
-    _start_thread("reaper", _reap_until, stop, url, lease, client, context)
+    _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
     parent_died = _wait(stop, os.getppid() if exit_with_parent else None)
     _leave(lease, client, 0.0 if parent_died else drain_s)
+    lifeline.release()
     engine.dispose()
 
 
@@ -97,21 +97,6 @@ def _end_when_lost(lease: Lease) -> None:
         if lease.is_lost:
             log.error("worker %s lost its lease and ends: others may hold its jobs", lease.worker_id)
             os._exit(FENCED)
-
-
-def _reap_until(stop: threading.Event, url: str, lease: Lease, client: DBOSClient, context: WorkflowContext) -> None:
-    while True:
-        try:
-            for dead_id in lease.take_over_from_dead():
-                if has_unfinished_jobs(client, dead_id):
-                    log.warning("worker %s died; its jobs go back to their queue", dead_id)
-                    hand_over(url, dead_id)
-                lease.bury(dead_id)
-            close_abandoned_jobs(client, context)
-        except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied
-            log.exception("could not look after dead workers; trying again")
-        if stop.wait(min(lease.ttl_s / 4, LOOK_FOR_DEAD_S)):
-            return
 
 
 def _wait(stop: threading.Event, parent: int | None) -> bool:

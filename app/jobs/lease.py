@@ -6,9 +6,10 @@ stops itself (`Lease.is_lost`). Taking over from a dead worker is a compare-and-
 
 import threading
 import time
+from collections.abc import Collection
 from datetime import UTC, datetime
 
-from sqlalchemy import ColumnElement, Engine, delete, insert, literal_column, update
+from sqlalchemy import ColumnElement, Engine, and_, delete, insert, literal_column, or_, update
 from sqlalchemy.exc import SQLAlchemyError
 
 from app.db.tables import Worker
@@ -63,8 +64,8 @@ class Lease:
         with self._engine.begin() as connection:
             connection.execute(last)
 
-    def take_over_from_dead(self) -> list[str]:
-        """Become the heir of every worker whose beat is too old, and return their ids.
+    def take_over_from_dead(self, known_dead: Collection[str] = ()) -> list[str]:
+        """Become the heir of every worker whose beat is too old or that is known to be dead, and return their ids.
 
         An heir that dies too before it calls `bury` leaves a dead row whose beat grows old again.
         """
@@ -72,7 +73,10 @@ class Lease:
             update(Worker)
             .where(
                 Worker.id != self.worker_id,
-                Worker.beat < self._clock(-self.ttl_s),
+                or_(
+                    Worker.beat < self._clock(-self.ttl_s),
+                    and_(Worker.state == "live", Worker.id.in_(known_dead)),
+                ),
             )
             .values(state="dead", reaper=self.worker_id, beat=self._clock())
             .returning(Worker.id)

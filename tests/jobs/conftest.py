@@ -103,13 +103,15 @@ class Crew:
     """Worker processes, and what their fits wrote down."""
 
     def __init__(self, database_url: str, folder: Path) -> None:
+        self.folder = folder
         self._diary = folder / "diary"
         self._diary.touch()
         self._log = folder / "log"
         self.environment = {
             **os.environ,
             "ISODYN_DATABASE_URL": database_url,
-            "ISODYN_DATA_DIR": str(folder),
+            "ISODYN_DATA_DIR": str(folder / "var"),
+            "ISODYN_BLOB_URL": f"file://{folder / 'blobs'}",
             "ISODYN_WORKER_PROCESSES": "3",
             "ISODYN_TEST_DIARY": str(self._diary),
             "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'jobs'}",
@@ -120,9 +122,11 @@ class Crew:
     def command(**options: object) -> list[str]:
         return [sys.executable, "-c", START, json.dumps({"lease_ttl_s": 3.0, **options})]
 
-    def hire(self, **options: object) -> subprocess.Popen[bytes]:
+    def hire(self, data_dir: str = "var", **options: object) -> subprocess.Popen[bytes]:
+        """Start a worker. Workers with another data folder cannot see each other die, as on two machines."""
+        environment = {**self.environment, "ISODYN_DATA_DIR": str(self.folder / data_dir)}
         with self._log.open("a") as log:
-            process = subprocess.Popen(self.command(**options), env=self.environment, stderr=log)
+            process = subprocess.Popen(self.command(**options), env=environment, stderr=log)
         self._processes.append(process)
         return process
 

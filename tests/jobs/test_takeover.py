@@ -39,17 +39,25 @@ def workers(sessions: sessionmaker[Session]) -> set[str]:
         return set(session.scalars(select(Worker.id)))
 
 
-def test_a_restarted_worker_finishes_what_the_killed_one_began(crew: "Crew", site: "Site") -> None:
-    """Also the embedded worker: alone, it waits for the dead one's lease and no longer; its fit's process is gone."""
+@pytest.mark.parametrize(
+    ("successor", "ttl_s"),
+    [
+        pytest.param("var", 600.0, id="restarted, which knows of the death at once"),
+        pytest.param("elsewhere", 3.0, id="on another machine, which waits for the lease to run out"),
+    ],
+)
+def test_the_next_worker_finishes_what_a_killed_one_began(
+    crew: "Crew", site: "Site", successor: str, ttl_s: float
+) -> None:
     floor = site.floor(sleep_s=1.5)
-    first = crew.hire()
+    first = crew.hire(lease_ttl_s=ttl_s)
     _, job_id = site.upload(floor)
     site.wait_running(job_id)
     _, waiting = site.upload(floor)
     first.kill()
     (orphan,) = {entry["pid"] for entry in crew.diary(event="fit starts")}
     wait_dead(orphan)
-    crew.hire()
+    crew.hire(successor, lease_ttl_s=ttl_s)
     job = site.wait(job_id)
     assert (job.status, site.wait(waiting).status) == ("successful", "successful")
     assert len(crew.diary(event="fit starts", map_id=job.map_id)) == 2

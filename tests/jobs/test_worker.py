@@ -93,6 +93,7 @@ def test_a_killed_fit_process_is_tried_again(crew: "Crew", site: "Site") -> None
     assert len(crew.diary(event="fit starts", floor_id=floor.id)) == 2
 
 
+@pytest.mark.slow
 def test_a_fit_killed_every_time_fails_after_a_bounded_number(crew: "Crew", site: "Site") -> None:
     floor = site.floor(die_times=100)
     job = site.wait(site.upload(floor)[1])

@@ -1,0 +1,51 @@
+"""Looks after the dead: hands their jobs over, and closes jobs that the engine gave up."""
+
+import logging
+import threading
+from dataclasses import dataclass
+
+from dbos import DBOSClient
+
+from app.jobs.lease import Lease
+from workers.janitor import hand_over
+from workers.lifeline import Lifeline
+from workers.reconcile import close_abandoned_jobs, has_unfinished_jobs
+from workers.workflows import WorkflowContext
+
+__all__ = ["Reaper"]
+
+LOOK_EVERY_S = 5.0
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Reaper:
+    """Runs in every worker; the lease sees to it that each dead worker has one heir."""
+
+    database_url: str
+    lease: Lease
+    lifeline: Lifeline
+    client: DBOSClient
+    context: WorkflowContext
+
+    def run(self, stop: threading.Event) -> None:
+        """Look at once, and then again and again, until told to stop."""
+        while True:
+            try:
+                self._bury_the_dead()
+                close_abandoned_jobs(self.client, self.context)
+            except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied
+                log.exception("could not look after dead workers; trying again")
+            if stop.wait(min(self.lease.ttl_s / 4, LOOK_EVERY_S)):
+                return
+
+    def _bury_the_dead(self) -> None:
+        cut = self.lifeline.cut()
+        for dead_id in self.lease.take_over_from_dead(cut):
+            if has_unfinished_jobs(self.client, dead_id):
+                log.warning("worker %s died; its jobs go back to their queue", dead_id)
+                hand_over(self.database_url, dead_id)
+            self.lease.bury(dead_id)
+        for dead_id in cut:
+            self.lifeline.bury(dead_id)
