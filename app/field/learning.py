@@ -30,9 +30,11 @@ GOOD_ENOUGH = 1.5
 """A lattice whose pitch is within this factor of the suited one learns the same length."""
 
 FAINT_WALK_NOISE = WalkNoise(variance_ratio=0.3, length_m=1.5)
-WORTH_NATS = 3.0
-"""Errors are taken to be correlated along a walk when that makes the data this much more likely."""
-MAX_TRIALS = 24
+WORTH_NATS = 0.01
+"""Errors are taken to be correlated along a walk when that gains this log likelihood per observation and component."""
+MAX_TRIALS = 20
+WALK_NOISE_BOUNDS_LOG = np.log([(1e-2, 0.5), (1e4, 25.0)])
+"""Of the variance ratio and the length in metres: what varies faster or slower is white noise, or an offset."""
 COMPASS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 SMALLEST_STEP = np.log(1.5)
 
@@ -43,7 +45,8 @@ class _Learned:
 
     hyper: Hyperparameters
     log_parameters: Array
-    value: float
+    nats: float
+    """Negative log marginal likelihood per observation and component."""
 
 
 class _Learner:
@@ -62,7 +65,11 @@ class _Learner:
             TileStatistics(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise))
             for tile in self._chosen
         ]
-        return _Learned(*learn(tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias))
+        hyper, log_parameters, value = learn(
+            tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias
+        )
+        count = sum(survey.count for tile in tiles for survey in tile.surveys.values())
+        return _Learned(hyper, log_parameters, value / (count * len(hyper.signal_sd_uT)))
 
 
 def learn_hyperparameters(
@@ -87,15 +94,15 @@ def learn_hyperparameters(
 def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:
     """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
     best = learner.learn(FAINT_WALK_NOISE, white.log_parameters)
-    if best.value > white.value - WORTH_NATS:
+    if best.nats > white.nats - WORTH_NATS:
         return white
     centre, step = np.log([FAINT_WALK_NOISE.variance_ratio, FAINT_WALK_NOISE.length_m]), np.log([4.0, 2.0])
     direction, failures = 0, 0
     for trial in range(MAX_TRIALS):
         progress(0.5 + 0.5 * trial / MAX_TRIALS, "learning the errors along a walk")
-        point = centre + step * COMPASS[direction]
+        point = np.clip(centre + step * COMPASS[direction], *WALK_NOISE_BOUNDS_LOG)
         found = learner.learn(WalkNoise(*np.exp(point).tolist()), best.log_parameters)
-        if found.value < best.value:
+        if found.nats < best.nats:
             best, centre, failures = found, point, 0
             continue
         direction, failures = (direction + 1) % len(COMPASS), failures + 1
