@@ -69,7 +69,7 @@ class Samples:
             return self.B_uT
         if components == "level":
             return horizontal_and_vertical(self.B_uT)
-        return np.linalg.norm(self.B_uT, axis=1, keepdims=True)
+        return np.asarray(np.linalg.norm(self.B_uT, axis=1, keepdims=True))
 
     def path_length_m(self) -> Array:
         """(n,) distance walked since the first sample, along the floor."""
