@@ -157,9 +157,11 @@ class ClientView:
         shown = [ShownFloor.of(f, self._walks[f.id], grids.get(f.id), layer, height_index) for f in floors]
         scale, norm_scale = shared_scales(shown, layer)
         rings = [ring for f in floors for ring in f.rings_m]
-        self._origin_m = draw.local_origin_m(self._grids, rings, [w for s in shown for w in s.walks])
+        walks = [walk for s in shown for walk in s.walks]
+        self._origin_m = draw.local_origin_m(self._grids, rings, walks)
         if move_camera and self._grids:
-            _assign(self._spacing, max(draw.suggested_arrow_spacing_m(grid) for grid in self._grids))
+            _assign(self._spacing, draw.suggested_arrow_spacing_m(self._grids))
+            _assign(self._shown["walks"], not draw.walks_hide_the_field(walks, self._grids))
             _assign(self._explode, draw.suggested_separation_m(self._grids))
         with self._client.atomic():
             self._client.scene.reset()

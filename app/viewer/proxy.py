@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import gzip
 import hashlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,8 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
 __all__ = ["CLOSE_SIGNED_OUT", "CLOSE_UNREACHABLE", "PAGE_POLICY", "ViserPage", "fetch_page", "passes", "relay"]
+
+_log = logging.getLogger(__name__)
 
 CLOSE_SIGNED_OUT = 4401
 CLOSE_UNREACHABLE = 1011
@@ -110,7 +113,9 @@ async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[Non
         finally:
             for task in flows:
                 task.cancel()
-            await asyncio.gather(*flows, return_exceptions=True)
+            for outcome in await asyncio.gather(*flows, return_exceptions=True):
+                if isinstance(outcome, Exception):
+                    _log.warning("a viewer connection broke", exc_info=outcome)
         await _close_browser(browser, upstream, signed_out=ended.done())
     return True
 

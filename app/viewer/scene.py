@@ -43,6 +43,7 @@ __all__ = [
     "suggested_separation_m",
     "surface",
     "walk_segments",
+    "walks_hide_the_field",
 ]
 
 MAX_POINTS = 300_000
@@ -100,7 +101,7 @@ def camera_pose(
     if top:
         return target + np.array([0.0, -1e-3, 0.85 * max(width, depth, 2.0) + height / 2]), target
     reach = max(float(np.hypot(width, depth)), 2.0) * 0.57 + 0.45 * height
-    slant = np.array([-0.12, -0.8, 0.8]) if height < 0.2 * depth else np.array([-0.2, -1.0, 0.55])
+    slant = np.array([-0.12, -0.8, 0.8]) if height < 0.2 * depth else np.array([-0.2, -0.9, 0.75])
     return target + reach * slant / np.linalg.norm(slant) * 1.25, target
 
 
@@ -126,10 +127,21 @@ def surface(grid: FieldGrid, values: Array, scale: ColourScale, origin_m: Array,
     return Surface(np.dstack([scale.rgb(filled), alpha]), (float(x), float(y), z), (nx * cell, ny * cell))
 
 
-def suggested_arrow_spacing_m(grid: FieldGrid, height_index: int = 0) -> float:
-    """A spacing in metres, a multiple of the cell size, that gives some hundreds of arrows, few enough to be read."""
-    cells = max(1, int(grid.measured[height_index].sum()))
-    return grid.resolution_m * max(1, int(np.ceil(np.sqrt(cells / _USUAL_ARROWS))))
+def suggested_arrow_spacing_m(grids: Sequence[FieldGrid], height_index: int = 0) -> float:
+    """A spacing in metres, a multiple of the cell size, giving some hundreds of arrows in all: few enough to read."""
+    spacings = []
+    for grid in grids:
+        cells = max(1, int(grid.measured[min(height_index, len(grid.heights_m) - 1)].sum()))
+        stride = max(1, int(np.ceil(np.sqrt(cells * min(len(grids), 3) / _USUAL_ARROWS))))
+        spacings.append(grid.resolution_m * stride)
+    return max(spacings, default=1.0)
+
+
+def walks_hide_the_field(walks: Sequence[Walk], grids: Sequence[FieldGrid]) -> bool:
+    """Whether the walks lie so close, under about four metres apart, that little of a layer is seen between them."""
+    length_m = sum(float(np.linalg.norm(np.diff(w.p_building_m[:, :2], axis=0), axis=1).sum()) for w in walks)
+    area_m2 = sum(float(grid.measured[0].sum()) * grid.resolution_m**2 for grid in grids)
+    return bool(grids) and length_m > 0.25 * area_m2
 
 
 def suggested_separation_m(grids: Sequence[FieldGrid]) -> float:
@@ -140,13 +152,13 @@ def suggested_separation_m(grids: Sequence[FieldGrid]) -> float:
     bounds = np.array([grid.bounds_m for grid in grids])
     depth = float(bounds[:, 4].max() - bounds[:, 1].min())
     gap = (heights[-1] - heights[0]) / (len(heights) - 1)
-    return float(np.clip(np.round(2.0 * (0.95 * depth - gap)) / 2.0, 0.0, 40.0))
+    return float(np.clip(np.round(2.0 * (0.85 * depth - gap)) / 2.0, 0.0, 40.0))
 
 
 def field_arrows(grid: FieldGrid, origin_m: Array, spacing_m: float, height_index: int = 0) -> Arrows:
     """The mean field at every measured cell of a coarser lattice, at most MAX_ARROWS, standing on the map's plane.
 
-    The 99th percentile of the magnitudes spans 1.4 times the spacing. A level map knows only the vertical direction, so
+    The 99th percentile of the magnitudes spans 1.2 times the spacing. A level map knows only the vertical direction, so
     its arrows are vertical; a norm map has none.
     """
     components = {"vector": 3, "level": 2, "norm": 0}[grid.components]
@@ -162,7 +174,7 @@ def field_arrows(grid: FieldGrid, origin_m: Array, spacing_m: float, height_inde
         B_uT = np.stack([np.zeros(len(j)), np.zeros(len(j)), B_uT[:, 1]], axis=1)
     magnitude = np.linalg.norm(B_uT, axis=1)
     spacing = stride * grid.resolution_m
-    direction = B_uT * (1.4 * spacing / max(float(np.percentile(magnitude, 99.0)), 1e-9))
+    direction = B_uT * (1.2 * spacing / max(float(np.percentile(magnitude, 99.0)), 1e-9))
     tail = np.empty_like(direction)
     tail[:, 0] = grid.origin_m[0] + i * grid.resolution_m - origin_m[0]
     tail[:, 1] = grid.origin_m[1] + j * grid.resolution_m - origin_m[1]

@@ -25,6 +25,7 @@ from app.viewer.scene import (
     suggested_arrow_spacing_m,
     surface,
     walk_segments,
+    walks_hide_the_field,
 )
 from app.viewer.source import Walk
 from app.viewer.viser_server import start_viser, stop_viser
@@ -61,7 +62,8 @@ def static_view_html(
 ) -> str:
     """One HTML file of a map at one of its heights: every layer, field arrows, walks, outline and legends.
 
-    |B|, arrows and walks are shown at first; the other layers wait in the scene tree (the button at the top right).
+    |B|, arrows and walks (unless they would hide the field) are shown at first; the rest waits in the scene tree, which
+    the button at the top right opens.
     `rings_m`: outline of the floor, drawn at `elevation_m` (the map's own height when None).
     """
     names = [layer for layer in layer_names(grid.components) if layer != "measured"]
@@ -92,12 +94,13 @@ def _draw_lines_and_arrows(
     scale: ColourScale,
     height_index: int,
 ) -> None:
-    arrows = field_arrows(grid, origin_m, suggested_arrow_spacing_m(grid, height_index), height_index)
+    arrows = field_arrows(grid, origin_m, suggested_arrow_spacing_m([grid], height_index), height_index)
     if len(arrows.ends_m):
         draw_arrows(server.scene, "/Field arrows", arrows, scale)
     segments, colours = walk_segments(walks, origin_m)
     if len(segments):
-        draw_lines(server.scene, "/Survey walks", segments, colours, 2.0)
+        hidden = walks_hide_the_field(walks, [grid])
+        draw_lines(server.scene, "/Survey walks", segments, colours, 2.0, visible=not hidden)
     slab = float(grid.heights_m[height_index]) if elevation_m is None else elevation_m
     draw_ground(server.scene, "/Ground", [grid], origin_m, slab - 0.02)
     outline = ring_segments(rings_m, slab, origin_m)

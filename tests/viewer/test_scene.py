@@ -50,7 +50,8 @@ def test_a_map_without_any_measured_cell_draws_nothing(grid_of):
     picture = scene.surface(grid, layer_values(grid, "norm"), SCALE, np.zeros(3))
     assert not picture.rgba[..., 3].any()
     assert len(scene.field_arrows(grid, np.zeros(3), 1.0).ends_m) == 0
-    assert scene.suggested_arrow_spacing_m(grid) > 0
+    assert scene.suggested_arrow_spacing_m([grid]) > 0
+    assert scene.suggested_arrow_spacing_m([]) > 0
 
 
 def test_arrows_point_along_the_field_and_stand_on_the_map(grid_of):
@@ -90,6 +91,13 @@ def test_walks_are_joined_within_but_not_between(walk_of):
     assert np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).max() < 0.3
     assert not (colours[0] == colours[-1]).all()
     assert len(scene.walk_segments([], np.zeros(3))[0]) == 0
+
+
+def test_walks_in_narrow_lanes_hide_the_field_and_a_few_do_not(grid_of, walk_of):
+    grid = grid_of()
+    assert not scene.walks_hide_the_field([walk_of("a"), walk_of("b")], [grid])
+    assert scene.walks_hide_the_field([walk_of("a", offset_m=0.5 * k) for k in range(8)], [grid])
+    assert not scene.walks_hide_the_field([walk_of("a")], [])
 
 
 def test_an_outline_is_closed():
