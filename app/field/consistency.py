@@ -2,27 +2,54 @@
 
 The seed's rule asks for 96 % of errors within two predictive sds in every component. A perfectly calibrated map has
 95.45 %, so beside the rule each component gets the probability of a coverage this low by chance, with as many
-independent samples as the distance over which errors stay correlated allows. A stretch, or a survey, is called
-inconsistent when it fails the rule *and* chance does not explain it.
+independent samples as the distance over which errors stay correlated allows; and since coverage says nothing of how far
+outside an error is, their mean square is tested too. A stretch, or a survey, is called inconsistent when it fails the
+rule *and* chance does not explain it.
+
+The noise of a map is learned from all its surveys, so a bad one widens the sd it is judged by. Each survey is therefore
+judged by sds brought down to what the errors of the other surveys show, where those are much smaller.
 """
+
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc
+from scipy.special import betainc, chdtrc
 
 from app.field.leave_one_out import HeldOut
 from app.field.spec import ComponentConsistency, ConsistencyReport, SegmentConsistency
 from app.geometry import Array
 
-__all__ = ["MIN_JUDGED", "check_consistency"]
+__all__ = ["MIN_JUDGED", "check_consistency", "check_surveys"]
 
 SEED_COVERAGE = 0.96
 NOMINAL_COVERAGE = 0.9545
-CHANCE = 1e-3
-"""Below this probability a low coverage is no longer put down to chance."""
+CHANCE = 1e-4
+"""Below this probability a low coverage, or a large mean square, is no longer put down to chance."""
 
 MIN_JUDGED = 20
 SEGMENT_M = 10.0
+ROBUST_SD = 1.4826
+"""Sd of a Gaussian over the median of its absolute values."""
+GENEROSITY = 1.5
+"""Real errors have heavier tails than their median tells: sds come down to this many robust ones, no lower."""
+
+
+def check_surveys(
+    held_out: Mapping[str, HeldOut], names: tuple[str, ...], correlation_m: float
+) -> dict[str, ConsistencyReport]:
+    """The report of every survey, each judged by what the errors of the others show."""
+    absolute = {survey_id: np.abs(h.standardised) for survey_id, h in held_out.items()}
+    reports = {}
+    for survey_id, own in held_out.items():
+        others = [errors for other, errors in absolute.items() if other != survey_id and len(errors)]
+        scale = np.ones(len(names))
+        if others:
+            shown = GENEROSITY * ROBUST_SD * np.median(np.concatenate(others), axis=0)
+            scale = np.clip(shown, 1e-3, 1.0)
+        reports[survey_id] = check_consistency(replace(own, sd_uT=own.sd_uT * scale), names, correlation_m)
+    return reports
 
 
 def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: float) -> ConsistencyReport:
@@ -31,7 +58,7 @@ def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: 
     if judged < MIN_JUDGED:
         reason = f"{judged} of its samples are near another survey, {MIN_JUDGED} are needed: survey the area again"
         return ConsistencyReport("unjudged", None, judged, None, reason=reason)
-    coverage, p_values = _judge(held_out, np.flatnonzero(held_out.judged), correlation_m)
+    coverage, p_values, acceptable = _judge(held_out, np.flatnonzero(held_out.judged), correlation_m)
     error_uT, sd_uT = held_out.error_uT[held_out.judged], held_out.sd_uT[held_out.judged]
     components = tuple(
         ComponentConsistency(
@@ -45,7 +72,7 @@ def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: 
         for c, name in enumerate(names)
     )
     segments = _segments(held_out, correlation_m)
-    consistent = _acceptable(coverage, p_values) and all(segment.consistent for segment in segments)
+    consistent = acceptable and all(segment.consistent for segment in segments)
     return ConsistencyReport(
         status="consistent" if consistent else "inconsistent",
         seed_2sigma_96=all(component.seed_2sigma_96 for component in components),
@@ -65,14 +92,13 @@ def _segments(held_out: HeldOut, correlation_m: float) -> tuple[SegmentConsisten
     for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         indices = start + np.flatnonzero(held_out.judged[start:stop])
         if len(indices) >= MIN_JUDGED:
-            coverage, p_values = _judge(held_out, indices, correlation_m)
-            acceptable = _acceptable(coverage, p_values)
+            coverage, _, acceptable = _judge(held_out, indices, correlation_m)
             segments.append(SegmentConsistency(start, stop, tuple(coverage.tolist()), acceptable))
     return tuple(segments)
 
 
-def _judge(held_out: HeldOut, indices: NDArray[np.int64], correlation_m: float) -> tuple[Array, Array]:
-    """Coverage (c,) of the samples at `indices`, and the probability (c,) of one as low or lower if calibrated."""
+def _judge(held_out: HeldOut, indices: NDArray[np.int64], correlation_m: float) -> tuple[Array, Array, bool]:
+    """Coverage (c,) of the samples at `indices`, the probability (c,) of one as low if calibrated, and the verdict."""
     standardised = held_out.error_uT[indices] / held_out.sd_uT[indices]
     coverage = np.mean(np.abs(standardised) <= 2.0, axis=0)
     walked_m = held_out.path_m[indices[-1]] - held_out.path_m[indices[0]]
@@ -81,8 +107,7 @@ def _judge(held_out: HeldOut, indices: NDArray[np.int64], correlation_m: float) 
         independent = min(independent, 1.0 + walked_m / (2.0 * correlation_m))
     misses = (1.0 - coverage) * independent
     p_values = betainc(np.maximum(misses, 1e-9), independent - misses + 1.0, 1.0 - NOMINAL_COVERAGE)
-    return coverage, np.where(misses > 0.0, p_values, 1.0)
-
-
-def _acceptable(coverage: Array, p_values: Array) -> bool:
-    return bool(np.all((coverage >= SEED_COVERAGE) | (p_values >= CHANCE)))
+    p_values = np.where(misses > 0.0, p_values, 1.0)
+    mean_square = np.mean(np.square(standardised), axis=0)
+    by_chance = (p_values >= CHANCE) & (chdtrc(independent, independent * mean_square) >= CHANCE)
+    return coverage, p_values, bool(np.all((coverage >= SEED_COVERAGE) | by_chance))

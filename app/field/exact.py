@@ -61,6 +61,11 @@ class ExactPosterior:
         explained = np.sum(np.square(solve_triangular(self.factor, prior.T, lower=True, check_finite=False)), axis=0)
         return prior @ self.dual_uT, np.maximum(1.0 - explained / self.process.signal_sd_uT**2, 0.0)
 
+    def mean_at(self, points_m: Array) -> Array:
+        """Mean (n,) about the ambient field, without the cost of the variance."""
+        prior = covariance(self.process.kernel, _distances_m(points_m, self.position_m), self.process.length_m)
+        return np.asarray(np.square(self.process.signal_sd_uT) * prior @ self.dual_uT)
+
     def gradient_at(self, points_m: Array) -> Array:
         """(n, 2) exact derivative of the mean with x and y, uT/m."""
         slope = covariance_slope(

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from app.errors import InvalidInput
-from app.field.consistency import check_consistency
+from app.field.consistency import check_surveys
 from app.field.estimate import FieldEstimate
 from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
@@ -50,7 +50,7 @@ def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _s
         hyperparameters={"engine": spec.engine} | estimate.hyperparameters,
         score=scored,
         score_reason=None if scored else _score_reason(observed),
-        consistency={name: check_consistency(h, names, correlation_m) for name, h in held_out.items()},
+        consistency=check_surveys(held_out, names, correlation_m),
     )
 
 

@@ -30,7 +30,7 @@ GOOD_ENOUGH = 1.5
 """A lattice whose pitch is within this factor of the suited one learns the same length."""
 
 FAINT_WALK_NOISE = WalkNoise(variance_ratio=0.3, length_m=1.5)
-WORTH_NATS = 0.01
+WORTH_NATS = 0.02
 """Errors are taken to be correlated along a walk when that gains this log likelihood per observation and component."""
 MAX_TRIALS = 20
 WALK_NOISE_BOUNDS_LOG = np.log([(1e-2, 0.5), (1e4, 25.0)])

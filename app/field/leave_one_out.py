@@ -111,6 +111,8 @@ def _integral_length(held_out: HeldOut) -> float | None:
     padded = np.full((cells[-1] - cells[0] + 1, z.shape[1]), np.nan)
     padded[cells - cells[0]] = z
     power = np.nanmean(np.square(padded))
+    if power == 0.0:
+        return 0.0
     total = 0.5
     for lag in range(1, min(int(MAX_LAG_M / LAG_M), len(padded) - 1)):
         products = padded[lag:] * padded[:-lag]

@@ -9,12 +9,10 @@ from scipy.spatial import cKDTree
 
 from app.field.observations import Walk
 from app.field.raster import GridFrame
+from app.field.tiles import REACH_M
 from app.geometry import Array
 
-__all__ = ["MAX_SD_OF_PRIOR", "REACH_M", "measured_cells", "near_other_walks"]
-
-REACH_M = 1.0
-"""Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
+__all__ = ["MAX_SD_OF_PRIOR", "measured_cells", "near_other_walks"]
 
 MAX_SD_OF_PRIOR = 0.9
 """A cell whose sd is above this share of the prior's has had less than a fifth of its variance explained."""

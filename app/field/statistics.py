@@ -80,9 +80,11 @@ class TiledWalks:
         self._walks = {walk.survey_id: walk for walk in walks}
         self._ambient_uT = ambient_uT
         self._members: dict[Tile, dict[str, NDArray[np.int64]]] = {}
+        worth_fitting = set().union(*(lattice.reached(walk.position_m[:, :2]) for walk in walks))
         for walk in walks:
             for tile, inside in lattice.fitting(walk.position_m[:, :2]).items():
-                self._members.setdefault(tile, {})[walk.survey_id] = inside
+                if tile in worth_fitting:
+                    self._members.setdefault(tile, {})[walk.survey_id] = inside
 
     def counts(self) -> dict[Tile, int]:
         """Tile -> observations it is fitted from, in order of tile."""

@@ -16,7 +16,7 @@ from app.field.basis import CosineBasis
 from app.field.spec import Kernel
 from app.geometry import Array
 
-__all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "Lattice", "Tile"]
+__all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "REACH_M", "Lattice", "Tile"]
 
 PITCHES_M = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 64.0, 100.0)
 PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
@@ -24,6 +24,10 @@ PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52":
 MARGIN = 0.3
 OVERLAP = 0.1
 FUNCTIONS_PER_AXIS = 20
+
+
+REACH_M = 1.0
+"""Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
 
 
 class Tile(NamedTuple):
@@ -61,6 +65,10 @@ class Lattice:
     def answering(self, points_m: Array) -> dict[Tile, NDArray[np.int64]]:
         """Tile -> indices, ascending, of the points (n, 2) at which it has a weight."""
         return self._members(points_m, self.overlap)
+
+    def reached(self, points_m: Array) -> set[Tile]:
+        """The tiles that answer anywhere within REACH_M of a point (n, 2); the others have no measured cell."""
+        return set(self._members(points_m, min(self.margin, self.overlap + REACH_M / self.pitch_m)))
 
     def answers_between(self, axis: int, tile: Tile) -> tuple[float, float]:
         """The interval of x (axis 0) or y (axis 1) over which a tile has a weight."""

@@ -1,5 +1,6 @@
 """A room of random dipoles below the floor and above the ceiling: curl- and divergence-free where one walks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,9 +68,14 @@ class Room:
         return path if index % 2 == 0 else path[:, ::-1]
 
 
+@pytest.fixture(scope="session")
+def make_room() -> Callable[[int], Room]:
+    return lambda seed: Room.random(np.random.default_rng(seed))
+
+
 @pytest.fixture
-def room() -> Room:
-    return Room.random(np.random.default_rng(7))
+def room(make_room) -> Room:
+    return make_room(7)
 
 
 @pytest.fixture(autouse=True, scope="session")

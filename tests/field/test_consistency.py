@@ -1,0 +1,84 @@
+"""Kuevor B14: a clean survey passes, a corrupted stretch is found where it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.field.consistency import check_consistency
+from app.field.fit import fit_map
+from app.field.leave_one_out import HeldOut
+from app.field.spec import MapSpec
+
+SPEC = MapSpec(resolution_m=0.5)
+
+
+@pytest.fixture(scope="module")
+def walks(room_of_module):
+    return room_of_module.lanes(np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def room_of_module(make_room):
+    return make_room(7)
+
+
+def bad_segments(report):
+    return [s for s in report.segments if not s.consistent]
+
+
+def test_clean_surveys_are_consistent(walks):
+    reports = fit_map(walks, SPEC).consistency
+    assert {r.status for r in reports.values()} == {"consistent"}
+    assert all(c.p_value > 1e-3 for r in reports.values() for c in r.components)
+
+
+def test_an_offset_from_the_middle_on_is_found_there(walks):
+    victim = walks["survey-2"]
+    field = victim.B_uT.copy()
+    middle = len(victim) // 2
+    field[middle:] += [5.0, 0.0, 0.0]
+    report = fit_map(walks | {"survey-2": replace(victim, B_uT=field)}, SPEC).consistency["survey-2"]
+    assert report.status == "inconsistent"
+    assert report.seed_2sigma_96 is False
+    assert bad_segments(report)
+    assert all(s.stop > middle for s in bad_segments(report))
+    assert all(not s.consistent for s in report.segments if s.start >= middle)
+    bx, by, _ = report.components
+    assert bx.p_value < 0.05 < by.p_value
+
+
+def test_a_stretch_turned_by_a_right_angle_is_found(walks):
+    victim = walks["survey-1"]
+    field = victim.B_uT.copy()
+    third = len(victim) // 3
+    field[:third] = np.column_stack([-field[:third, 1], field[:third, 0], field[:third, 2]])
+    report = fit_map(walks | {"survey-1": replace(victim, B_uT=field)}, SPEC).consistency["survey-1"]
+    assert report.status == "inconsistent"
+    assert all(not s.consistent for s in report.segments if s.stop <= third)
+    assert all(s.start < third for s in bad_segments(report))
+
+
+def test_a_survey_far_from_the_others_is_unjudged(make_room):
+    room = make_room(3)
+    rng = np.random.default_rng(0)
+    walks = {
+        "near": room.walk(rng, np.array([[0.0, 1.0], [10.0, 1.0]])),
+        "far": room.walk(rng, np.array([[0.0, 8.0], [10.0, 8.0]])),
+    }
+    fitted = fit_map(walks, SPEC)
+    assert {r.status for r in fitted.consistency.values()} == {"unjudged"}
+    assert all("again" in r.reason for r in fitted.consistency.values())
+    assert fitted.score is None
+    assert "twice" in fitted.score_reason
+
+
+def test_the_p_value_accounts_for_correlation():
+    n = 400
+    error = np.zeros((n, 1))
+    error[:40] = 3.0  # coverage 0.9: forty independent failures, or one long one
+    held_out = HeldOut(error, np.ones((n, 1)), np.ones(n, dtype=bool), 0.1 * np.arange(n))
+    independent = check_consistency(held_out, ("norm",), 0.0).components[0].p_value
+    correlated = check_consistency(held_out, ("norm",), 5.0).components[0].p_value
+    assert independent < 1e-4
+    assert correlated > 0.05

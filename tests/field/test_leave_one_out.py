@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+
+from app.field.exact import estimate_by_exact
+from app.field.hilbert import posterior
+from app.field.hyperparameters import Hyperparameters
+from app.field.leave_one_out import HeldOut, HeldOutPrediction, error_correlation_m, score
+from app.field.observations import observe
+from app.field.spec import MapSpec
+from app.field.statistics import TiledWalks, add_evidence, marginalise
+from app.field.tiles import Lattice
+
+AMBIENT = np.array([18.0, 3.0, -44.0])
+HYPER = Hyperparameters(
+    "matern32", 1.8, np.full(3, 2.5), white_ratio=0.02, bias_ratio=0.05, walk_ratio=0.1, walk_length_m=1.5
+)
+
+
+def evidence_by_tile(walks):
+    tiled = TiledWalks(Lattice.for_length("matern32", 1.8), walks, AMBIENT)
+    for tile in tiled.counts():
+        basis = tiled.lattice.basis(tile)
+        surveys = tiled.statistics(tile, HYPER.walk_noise_in(basis))
+        white = HYPER.white_ratio_in(basis)
+        yield tile, basis, {name: marginalise(s, white, HYPER.bias_ratio) for name, s in surveys.items()}
+
+
+def test_leaving_out_by_subtraction_equals_a_refit_without_the_survey(room):
+    walks = observe(room.lanes(np.random.default_rng(1)), "vector")
+    left_out, others = walks[1], [walks[0], *walks[2:]]
+    predicted = HeldOutPrediction(Lattice.for_length("matern32", 1.8), walks, HYPER)
+    for tile, _, evidence in evidence_by_tile(walks):
+        predicted.add(tile, evidence, add_evidence(evidence.values()))
+
+    points = left_out.position_m[:, :2]
+    mean, variance = np.zeros((len(points), 3)), np.ones(len(points))
+    lattice = Lattice.for_length("matern32", 1.8)
+    answering = lattice.answering(points)
+    for tile, basis, evidence in evidence_by_tile(others):
+        inside = answering.get(tile, np.array([], dtype=int))
+        at, ratio = posterior(basis, add_evidence(evidence.values()), HYPER).at(points[inside])
+        weight = lattice.weight(0, tile, points[inside, 0]) * lattice.weight(1, tile, points[inside, 1])
+        mean[inside] += weight[:, None] * at
+        variance[inside] += weight * (ratio - 1.0)
+    assert np.allclose(predicted.mean_uT[left_out.survey_id], mean, atol=1e-6)
+    assert np.allclose(predicted.variance_ratio[left_out.survey_id], variance, atol=1e-6)
+
+
+def test_the_exact_engine_leaves_out_by_honest_refits(room):
+    walks = observe(room.lanes(np.random.default_rng(1), surveys=3, lane_m=2.0), "norm")
+    ambient = np.median(np.concatenate([w.field_uT for w in walks]), axis=0)
+    estimate = estimate_by_exact(walks, ambient, MapSpec(engine="exact", resolution_m=1.0), None, lambda f, m: None)
+    left_out = walks[0]
+    error = left_out.field_uT - ambient - estimate.held_out_mean_uT[left_out.survey_id]
+    in_sample = np.std(left_out.field_uT)
+    assert 0.0 < np.sqrt(np.mean(np.square(error))) < in_sample
+    assert np.all(estimate.held_out_variance_ratio[left_out.survey_id] > 0.0)
+
+
+def held_out(standardised, step_m=0.1):
+    n = len(standardised)
+    return HeldOut(standardised, np.ones_like(standardised), np.ones(n, dtype=bool), step_m * np.arange(n))
+
+
+def test_score_of_calibrated_errors():
+    errors = np.random.default_rng(0).normal(size=(20_000, 2))
+    scored = score({"a": held_out(errors[:5000]), "b": held_out(errors[5000:])})
+    assert scored.held_out_samples == 20_000
+    assert scored.rmse_ut == pytest.approx((1.0, 1.0), abs=0.02)
+    assert scored.coverage_2sigma == pytest.approx((0.9545, 0.9545), abs=0.005)
+    assert scored.nlpd == pytest.approx(0.5 * np.log(2 * np.pi) + 0.5, abs=0.02)
+
+
+def test_nothing_judged_gives_no_score():
+    one = held_out(np.zeros((10, 1)))
+    assert score({"a": HeldOut(one.error_uT, one.sd_uT, np.zeros(10, dtype=bool), one.path_m)}) is None
+
+
+@pytest.mark.parametrize("length_m", [1.0, 3.0])
+def test_error_correlation_is_the_length_of_an_ornstein_uhlenbeck_error(length_m):
+    rng = np.random.default_rng(0)
+    rho = np.exp(-0.1 / length_m)
+    walks = {}
+    for walk in range(5):
+        e = np.zeros((4000, 1))
+        for i in range(1, len(e)):
+            e[i] = rho * e[i - 1] + np.sqrt(1 - rho**2) * rng.normal()
+        walks[str(walk)] = held_out(e)
+    assert error_correlation_m(walks) == pytest.approx(length_m, rel=0.35)
+
+
+def test_white_errors_are_uncorrelated():
+    assert error_correlation_m({"a": held_out(np.random.default_rng(0).normal(size=(4000, 3)))}) < 0.3
