@@ -36,6 +36,9 @@ def evaluate(
     session_bias: Annotated[
         bool, typer.Option(help="take out the hard iron that mapping walks show for a session")
     ] = True,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="judge by mapping walks only, to choose parameters")
+    ] = False,
     processes: Annotated[int, typer.Option(min=1, max=2, help="child processes")] = 2,
 ) -> None:
     """Hold one walk in five out, map the rest, locate windows of the held-out walks, and print how good that is."""
@@ -55,6 +58,7 @@ def evaluate(
         spec=MapSpec(components=components, resolution_m=resolution_m),  # type: ignore[arg-type]
         composition=composition,  # type: ignore[arg-type]
         session_bias=session_bias,
+        rehearse=rehearse,
         processes=processes,
     )
     errors = Console(stderr=True)

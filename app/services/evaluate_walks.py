@@ -52,12 +52,15 @@ class EvaluationPlan:
 
     session_bias   take the hard iron that the mapping walks show for a calibration session out of its walks, held-out
                    ones included: a phone keeps its session, and its bias, from one walk to the next
+    rehearse       leave the held-out walks out altogether and hold out one in five of the others: for choosing
+                   parameters, so that nothing is tuned on the walks that judge
     """
 
     window_lengths_m: tuple[float, ...] = (10.0, 20.0, 40.0)
     spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0))
     composition: Composition = "raw"
     session_bias: bool = True
+    rehearse: bool = False
     options: LocateOptions = field(default_factory=LocateOptions)
     processes: int = 2
 
@@ -118,6 +121,8 @@ class Evaluation:
 def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluation:
     """Evaluate the floors under `directory`. Raises InvalidInput when there is nothing to evaluate."""
     floors, unreadable = _read_floors(directory, told)
+    if plan.rehearse:
+        floors = {floor_id: {name: walks[name] for name in hold_out(walks)[0]} for floor_id, walks in floors.items()}
     if plan.session_bias:
         floors = {floor_id: calibrate_sessions(walks) for floor_id, walks in floors.items()}
     with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=_one_thread) as pool:

@@ -1,0 +1,244 @@
+"""Evaluation on walks: a small building whose answer is known, and the pieces one by one."""
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from app.cli import evaluate as command
+from app.errors import InvalidInput
+from app.field.samples import Samples
+from app.services.evaluate_walks import (
+    Evaluation,
+    EvaluationPlan,
+    JudgedWindow,
+    Place,
+    calibrate_sessions,
+    cut_windows,
+    evaluate_walks,
+    hold_out,
+)
+from app.services.evaluation_summary import rate, summarise
+from app.survey.walk import DeadReckoning, Walk
+
+STEP_S, STEP_M = 0.56, 0.64
+
+
+def field_uT(p, floor):
+    x, y = p[:, 0], p[:, 1]
+    return np.stack(
+        [
+            3 + 8 * np.sin(x / 3 + floor) + 2 * np.cos(y / 2),
+            26 + 7 * np.cos(x / 2.3 - 2 * floor),
+            -41 + 9 * np.sin(x / 2.7 + 3 * floor) + 2 * np.sin(y / 2),
+        ],
+        axis=1,
+    )
+
+
+def trace(floor: int, seed: int) -> bytes:
+    """A walk of about 27 m along a corridor and back into it, as a phone records it."""
+    rng = np.random.default_rng([floor, seed])
+    heading = np.pi * (seed % 2)
+    start = np.array([1.0 if heading == 0 else 28.0, 4.0 + rng.uniform(-0.4, 0.4)])
+    t_s = np.arange(0.0, 42 * STEP_S, 0.02)
+    walked = STEP_M / STEP_S * t_s
+    p = start + walked[:, None] * [np.cos(heading), np.sin(heading)]
+    attitude = Rotation.from_euler("z", heading - np.pi / 2) * Rotation.from_euler("x", 0.3)
+    force = 9.81 + 0.5 * (STEP_M / 0.41) ** 4 * np.cos(2 * np.pi * t_s / STEP_S)
+    force_body = attitude.inv().apply(force[:, None] * [0.0, 0.0, 1.0])
+    B_body = attitude.inv().apply(field_uT(p, floor)) + 0.3 * rng.standard_normal((len(p), 3))
+    dragged = Rotation.from_euler("z", 0.05 * rng.standard_normal()) * attitude
+    rotation_vector = dragged.as_quat(canonical=True)[:3]
+    bias = [-20.0, 9.5, -317.25]
+    lines = []
+    for k in range(len(t_s)):
+        stamp = 1_574_129_692_000 + round(1e3 * t_s[k])
+        if k % 200 == 0 or k == len(t_s) - 1:
+            lines.append(f"{stamp}\tTYPE_WAYPOINT\t{p[k, 0]:.3f}\t{p[k, 1]:.3f}")
+        for kind, values in (
+            ("ACCELEROMETER", force_body[k]),
+            ("GYROSCOPE", (0.0, 0.0, 0.0)),
+            ("ROTATION_VECTOR", rotation_vector),
+            ("MAGNETIC_FIELD_UNCALIBRATED", (*(B_body[k] + bias), *bias)),
+        ):
+            lines.append(f"{stamp}\tTYPE_{kind}\t" + "\t".join(f"{v:.6g}" for v in values) + "\t3")
+    return "\n".join([*lines, ""]).encode()
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory) -> Path:
+    """Two floors of ten walks, some packed, beside things that are no walks."""
+    folder = tmp_path_factory.mktemp("building")
+    for floor in (0, 1):
+        (folder / f"F{floor}").mkdir()
+        for seed in range(10):
+            data = trace(floor, seed)
+            name = f"F{floor}/walk-{seed}.txt"
+            if seed % 2:
+                (folder / f"{name}.gz").write_bytes(gzip.compress(data))
+            else:
+                (folder / name).write_bytes(data)
+        (folder / f"F{floor}" / "floor_info.json").write_text("{}")
+    (folder / "F0" / "broken.txt").write_bytes(b"nothing")
+    (folder / "F0" / "cut.txt.gz").write_bytes(gzip.compress(data)[:500])
+    (folder / "F9").mkdir()
+    (folder / "README.md").write_text("not a floor")
+    return folder
+
+
+def test_a_known_building_is_evaluated_end_to_end(building, tmp_path):
+    report = tmp_path / "report.json"
+    result = CliRunner().invoke(
+        _application(), [str(building), "--length", "10", "--length", "20", "--resolution", "0.5",
+                         "--processes", "1", "--json", str(report)],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    for words in ("each left out", "held-out walks", "right floor", "truth in 95 % radius", "broken.txt", "cut.txt.gz"):
+        assert words in result.output
+    document = json.loads(report.read_text())
+    windows = document["evaluation"]["windows"]
+    assert {w["floor_id"] for w in windows} == {"F0", "F1"}
+    assert {w["walk"] for w in windows} == {"walk-2", "walk-4", "walk-7", "walk-9"} & {w["walk"] for w in windows}
+    assert all(w["covered"] for w in windows)
+    long = [w for w in windows if w["length_m"] == 20.0]
+    assert np.mean([w["ml"]["right_floor"] and w["ml"]["error_m"] < 2.0 for w in long]) > 0.7
+    for floor in document["evaluation"]["floors"]:
+        assert max(floor["held_out"]["rmse_ut"]) < 4.0
+        assert not set(floor["mapping_walks"]) & set(floor["held_out_walks"])
+    assert len(document["summaries"]) == 4
+
+
+def _application():
+    import typer
+
+    application = typer.Typer()
+    application.command()(command.evaluate)
+    return application
+
+
+def test_a_folder_without_floors_is_refused(tmp_path):
+    (tmp_path / "F1").mkdir()
+    (tmp_path / "F1" / "walk.txt").write_bytes(b"nothing")
+    with pytest.raises(InvalidInput, match="no floor to evaluate") as caught:
+        evaluate_walks(tmp_path, EvaluationPlan(), lambda *_: None)
+    assert caught.value.faults[0].location == "F1/walk.txt"
+    result = CliRunner().invoke(_application(), [str(tmp_path)])
+    assert result.exit_code == 1
+    result = CliRunner().invoke(_application(), [str(tmp_path), "--composition", "boiled"])
+    assert result.exit_code == 2
+
+
+def test_every_fifth_walk_by_name_is_held_out():
+    mapping, held_out = hold_out(dict.fromkeys("kjihgfedcba"))
+    assert held_out == ["e", "j"]
+    assert mapping == list("abcdfghik")
+
+
+def reckoned(n=400, heading_0=0.4):
+    """A circle of 10 m radius, 0.1 m per sample, seen from its first level frame."""
+    yaw = np.arange(n) * 0.01
+    place = 10.0 * np.stack([np.sin(yaw), 1.0 - np.cos(yaw), 0 * yaw], axis=1)
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    north = np.stack([np.sin(yaw + heading_0), np.cos(yaw + heading_0), 0 * yaw - 2.0], axis=1) * 20.0
+    empty = np.empty(0)
+    return DeadReckoning(place, yaw, north, q, empty, empty, heading_0 + yaw, np.full(n, 0.1), 4.0)
+
+
+def test_windows_are_cut_by_distance_and_turned_to_their_first_level_frame():
+    walk = reckoned()
+    windows = list(cut_windows(walk, 10.0))
+    assert len(windows) == 6
+    for part, window in windows:
+        assert np.linalg.norm(np.diff(window.displacement_m, axis=0), axis=1).sum() == pytest.approx(10.0, abs=0.2)
+        np.testing.assert_allclose(window.displacement_m[0], 0.0)
+        # A walk straight ahead at first, and a field that points north from start to end.
+        assert abs(np.arctan2(*window.displacement_m[1, 1::-1])) < 0.01
+        heading = window.heading_rad
+        assert heading == pytest.approx(0.4 + walk.yaw_rad[part][0])
+        c, s = np.cos(heading), np.sin(heading)
+        north = window.B_uT @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        np.testing.assert_allclose(north, np.tile([0.0, 20.0, -40.0], (len(north), 1)), atol=1e-9)
+        assert window.yaw_rad[0] == 0.0
+
+
+def test_windows_without_a_compass_have_no_heading():
+    walk = reckoned()
+    blind = DeadReckoning(*[getattr(walk, k) for k in ("displacement_m", "yaw_rad", "B_level_uT", "q_body_to_level",
+                                                       "step_t_s", "step_length_m")], None, None, 4.0)  # fmt: skip
+    assert all(window.heading_rad is None for _, window in cut_windows(blind, 10.0))
+
+
+def test_session_offsets_are_taken_out_of_samples_and_dead_reckoning_alike():
+    rng = np.random.default_rng(0)
+    offset = np.array([9.0, -6.0, 0.0])
+    walks = {}
+    for k in range(15):
+        heading = rng.uniform(-np.pi, np.pi)
+        along = np.arange(-8.0, 8.0, 0.2)
+        p = np.stack([along * np.cos(heading), along * np.sin(heading), 0 * along], axis=1)
+        q = Rotation.from_euler("z", heading - np.pi / 2).as_quat(scalar_first=True)
+        level_q = Rotation.from_euler("z", -np.pi / 2).as_quat(scalar_first=True)
+        truth = np.tile([1.0, 27.0, -40.0], (len(p), 1))
+        session, left = ("good", 0 * offset) if k % 3 else ("bad", offset)
+        B = truth + Rotation.from_quat(q, scalar_first=True).apply(left)
+        samples = Samples(along + 8, p, B, "building", np.tile(q, (len(p), 1)), session)
+        level = Rotation.from_euler("z", -heading).apply(B)
+        n = len(p)
+        dead = DeadReckoning(p, np.zeros(n), level, np.tile(level_q, (n, 1)), along, along, None, None, 4.0)
+        walks[f"{k:02d}"] = Walk(samples, {"heading": heading}, dead)
+    for walk in calibrate_sessions(walks).values():
+        np.testing.assert_allclose(walk.samples.B_uT, np.tile([1.0, 27.0, -40.0], (80, 1)), atol=0.5)
+        turned = Rotation.from_euler("z", walk.report["heading"]).apply(walk.dead_reckoning.B_level_uT)
+        np.testing.assert_allclose(turned, walk.samples.B_uT, atol=1e-9)
+
+
+def test_standard_errors_count_walks_not_windows():
+    rng = np.random.default_rng(1)
+    values, walks = [], []
+    for walk in range(40):
+        p = rng.uniform()
+        count = int(rng.integers(1, 9))
+        values += list(rng.uniform(size=count) < p)
+        walks += [str(walk)] * count
+    found = rate(values, walks)
+    by_walk = [np.array([v for v, w in zip(values, walks, strict=True) if w == str(k)]) for k in range(40)]
+    drawn = [np.concatenate([by_walk[k] for k in rng.integers(0, 40, 40)]).mean() for _ in range(4000)]
+    assert found.share == np.mean(values)
+    assert found.standard_error == pytest.approx(np.std(drawn), rel=0.15)
+    assert found.standard_error > 1.3 * np.sqrt(found.share * (1 - found.share) / len(values))
+    assert rate([], []).share is None
+    assert rate([True], ["a"]).standard_error is None
+    assert [str(rate(*each)) for each in (([], []), ([True], ["a"]), ([True, False], ["a", "b"]))] == [
+        "-", "1.00", ".50 ±.50"
+    ]  # fmt: skip
+
+
+def judged(walk, right, error_m, covered=True, status="fix", answers=True):
+    place = Place(right, error_m)
+    return JudgedWindow("F", walk, 20.0, covered, status, place, place if answers else None, None, place, 0.5, 2.0, 9.0)
+
+
+def test_summaries_count_a_wrong_floor_as_infinitely_wrong():
+    windows = (
+        judged("a", True, 1.0),
+        judged("a", True, 4.0, answers=False),
+        judged("b", False, 0.5, status="ambiguous"),
+        judged("c", True, 30.0, covered=False),
+    )
+    everything, covered = summarise(Evaluation((), windows, {}))
+    assert (everything.windows, everything.walks, covered.windows) == (4, 3, 3)
+    assert everything.techniques["ml"].within_2_m.share == 0.25
+    assert everything.techniques["ml"].within_5_m.share == 0.5
+    assert everything.techniques["ml"].error_percentiles_m == {"p50": 30.0, "p75": np.inf, "p90": np.inf}
+    assert everything.techniques["mlr"].available.share == 0.75
+    assert everything.techniques["abl"].available.share == 0.0
+    assert everything.techniques["abl"].right_floor.share is None
+    assert everything.right_floor.share == 0.75
+    assert (everything.radius_68.share, everything.radius_95.share) == (0.25, 0.5)
+    assert covered.fix_within_5_m.share == 1.0
+    assert covered.status["ambiguous"].share == pytest.approx(1 / 3)
