@@ -1,11 +1,12 @@
 """The composition root of the web process: settings in, one FastAPI application out."""
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from threading import Thread
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import RedirectResponse
 
 from app import __version__
 from app.api import buildings, health, jobs, locate, maps, surveys
@@ -72,12 +73,19 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         context.engine.dispose()
 
     context = open_context(settings)
-    viewer = ViewerApp(_authenticator(context), DatabaseViewerSource(context.sessions, context.blobs))
+
+    def authenticate(key: str) -> Identity | None:
+        with context.sessions() as session:
+            return recognise_key(session, key)
+
+    viewer = ViewerApp(authenticate, DatabaseViewerSource(context.sessions, context.blobs))
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
     for part in (health, buildings, surveys, maps, locate, jobs):
         app.include_router(part.router)
+    for path in ("/", "/view"):
+        app.add_api_route(path, _to_the_page, include_in_schema=False)
     app.mount("/view", viewer)
     add_problem_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, streams_itself=_is_upload)
@@ -86,16 +94,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
+def _to_the_page() -> RedirectResponse:
+    return RedirectResponse("/view/")
+
+
 def _is_upload(path: str) -> bool:
     return path.startswith("/v1/floors/") and path.endswith("/surveys")
-
-
-def _authenticator(context: Context) -> Callable[[str], Identity | None]:
-    def authenticate(key: str) -> Identity | None:
-        with context.sessions() as session:
-            return recognise_key(session, key)
-
-    return authenticate
 
 
 def _describe_problems(app: FastAPI) -> None:

@@ -149,7 +149,14 @@ def test_a_waiting_job_can_be_cancelled_and_events_end(
     service.run_jobs()
 
 
+@pytest.mark.parametrize("path", ["/", "/view"])
+def test_the_front_door_leads_to_the_page(service: Any, path: str) -> None:
+    answer = service.http.get(path, follow_redirects=True, headers={"Accept": "text/html"})
+    assert answer.status_code == 200
+    assert "key" in answer.text.lower()
+
+
 def test_all_routes_are_described(service: Any) -> None:
     described = {path for _, path in _routes(service.app)}
-    served = {route.path for route in service.app.routes if isinstance(route, APIRoute)}
+    served = {route.path for route in service.app.routes if isinstance(route, APIRoute) and route.include_in_schema}
     assert served <= described
