@@ -16,6 +16,7 @@ from types import FrameType
 
 from dbos import DBOS, DBOSClient
 from sqlalchemy import Engine
+from sqlalchemy.exc import SQLAlchemyError
 
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.engine import QUEUE, engine_configuration, open_client
@@ -41,12 +42,13 @@ def run_worker(
     builder: str = DEFAULT_BUILDER,
     lease_ttl_s: float = 30.0,
     drain_s: float = 10.0,
-    exit_with_parent: bool = False,
+    parent_pid: int | None = None,
 ) -> None:
     """Take jobs from the database until asked to stop; call it in the main thread.
 
     `builder` is the module that does the work (`workers.builder.Builder`). A worker that falls silent for
-    `lease_ttl_s` is dead to the others. Running jobs get `drain_s` to finish when the worker is asked to stop.
+    `lease_ttl_s` is dead to the others. Running jobs get `drain_s` to finish when the worker is asked to stop, and no
+    time when `parent_pid` is given and is not this process's parent any more.
     """
     stop = _stop_on_signals()
     url = settings.resolved_database_url
@@ -61,7 +63,7 @@ def run_worker(
     _start_thread("fence", _end_when_lost, lease)
     _launch(engine, lease.worker_id, settings.worker_processes)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
-    parent_died = _wait(stop, os.getppid() if exit_with_parent else None)
+    parent_died = _wait(stop, parent_pid)
     _leave(lease, client, 0.0 if parent_died else drain_s)
     lifeline.release()
     engine.dispose()
@@ -99,19 +101,23 @@ def _end_when_lost(lease: Lease) -> None:
             os._exit(FENCED)
 
 
-def _wait(stop: threading.Event, parent: int | None) -> bool:
+def _wait(stop: threading.Event, parent_pid: int | None) -> bool:
     """Until asked to stop; True if the reason is that the parent died."""
     while not stop.wait(0.5):
-        if parent is not None and os.getppid() != parent:
+        if parent_pid is not None and os.getppid() != parent_pid:
             return True
     return False
 
 
 def _leave(lease: Lease, client: DBOSClient, drain_s: float) -> None:
     """Take nothing new, let running jobs finish, and leave the rest to the others."""
-    busy = has_unfinished_jobs(client, lease.worker_id)
-    DBOS.destroy(workflow_completion_timeout_sec=ceil(drain_s) if busy else 0)
-    unfinished = has_unfinished_jobs(client, lease.worker_id)
-    lease.release(unfinished=unfinished)
+    try:
+        busy = has_unfinished_jobs(client, lease.worker_id)
+        DBOS.destroy(workflow_completion_timeout_sec=ceil(drain_s) if busy else 0)
+        unfinished = has_unfinished_jobs(client, lease.worker_id)
+        lease.release(unfinished=unfinished)
+    except SQLAlchemyError:
+        log.exception("worker %s could not sign off; its lease will run out", lease.worker_id)
+        unfinished = True
     if unfinished:
         os._exit(0)  # the threads of unfinished jobs must not go on: their jobs are somebody else's now

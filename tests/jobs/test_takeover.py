@@ -134,16 +134,14 @@ def test_an_idle_worker_leaves_no_trace(crew: "Crew", sessions: sessionmaker[Ses
 @pytest.mark.slow
 def test_a_worker_ends_with_its_parent(crew: "Crew", site: "Site") -> None:
     _, job_id = site.upload(site.floor(sleep_s=5.0))
-    parent = subprocess.Popen(
-        [
-            sys.executable, "-c",
-            "import json, subprocess, sys, time\n"
-            "child = subprocess.Popen(json.loads(sys.argv[1]))\n"
-            "print(child.pid, flush=True); time.sleep(100)",
-            json.dumps(crew.command(exit_with_parent=True, lease_ttl_s=600.0)),
-        ],
-        env=crew.environment, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    code = (
+        "import json, os, subprocess, sys, time\n"
+        "options = {'parent_pid': os.getpid(), 'lease_ttl_s': 600.0}\n"
+        "child = subprocess.Popen([*json.loads(sys.argv[1]), json.dumps(options)])\n"
+        "print(child.pid, flush=True); time.sleep(100)"
+    )
+    command = [sys.executable, "-c", code, json.dumps(crew.command()[:-1])]
+    parent = subprocess.Popen(command, env=crew.environment, stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     with parent.stdout:
         pid = int(parent.stdout.readline())
