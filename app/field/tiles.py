@@ -23,7 +23,7 @@ PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52":
 """A rough kernel has detail finer than its length and wants functions packed closer than a smooth one."""
 MARGIN = 0.3
 OVERLAP = 0.1
-FUNCTIONS_PER_AXIS = 20
+FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 14, "matern52": 18, "matern32": 20}
 
 
 REACH_M = 1.0
@@ -44,13 +44,13 @@ class Lattice:
     pitch_m: float
     margin: float = MARGIN
     overlap: float = OVERLAP
-    functions_per_axis: int = FUNCTIONS_PER_AXIS
+    functions_per_axis: int = FUNCTIONS_PER_AXIS["matern32"]
 
     @classmethod
     def for_length(cls, kernel: Kernel, length_m: float) -> "Lattice":
         """The finest lattice whose tiles are wide enough for a kernel of this length."""
         pitch = next((p for p in PITCHES_M if p >= PITCH_IN_LENGTHS[kernel] * length_m), PITCHES_M[-1])
-        return cls(pitch)
+        return cls(pitch, functions_per_axis=FUNCTIONS_PER_AXIS[kernel])
 
     def basis(self, tile: Tile) -> CosineBasis:
         """The functions a tile is fitted with, on its core and margin."""
