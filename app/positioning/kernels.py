@@ -78,43 +78,40 @@ def _raw_cost(ny, nx, j, i, z, row, column, noise, floor_variance, mean, varianc
 @numba.njit(cache=True, nogil=True)
 def _least_spread(low, high, weight, n):  # type: ignore[no-untyped-def]
     """A certified lower bound of min_b sum_k weight_k dist(b, [low_k, high_k])^2, tight to rounding."""
-    left, right = low[0], low[0]
-    total, sum_w = 0.0, 0.0
-    for k in range(n):
-        left, right = min(left, low[k]), max(right, high[k])
-        total += weight[k] * 0.5 * (low[k] + high[k])
-        sum_w += weight[k]
-    offset, best = total / sum_w, 0.0
+    left, right = high[0], low[0]
+    for k in range(1, n):
+        left, right = min(left, high[k]), max(right, low[k])
+    if right <= left:  # one offset lies in every interval
+        return 0.0
+    offset, best = 0.5 * (left + right), 0.0
     for _ in range(24):
         value, slope, curvature = 0.0, 0.0, 0.0
         for k in range(n):
-            d = offset - high[k] if offset > high[k] else (offset - low[k] if offset < low[k] else 0.0)
+            d = max(offset - high[k], 0.0) - max(low[k] - offset, 0.0)
             if d != 0.0:
                 value += weight[k] * d * d
-                slope += 2.0 * weight[k] * d
-                curvature += 2.0 * weight[k]
+                slope += weight[k] * d
+                curvature += weight[k]
         if slope > 0.0:
-            right = min(right, offset)
+            right = offset
         else:
-            left = max(left, offset)
-        best = max(best, value - abs(slope) * (right - left))
-        if curvature == 0.0 or abs(slope) * (right - left) <= 1e-9 * value:
-            break
-        step = offset - slope / curvature
-        if abs(step - offset) <= 1e-14 * (1.0 + abs(offset)):
-            best = max(best, value * (1.0 - 1e-9) - 1e-12)
+            left = offset
+        best = max(best, value - 2.0 * abs(slope) * (right - left))
+        step = offset - slope / curvature if curvature > 0.0 else offset
+        if value - best <= 0.02 * value or abs(step - offset) <= 1e-12 * (1.0 + abs(offset)):
             break
         offset = step if left < step < right else 0.5 * (left + right)
     return best
 
 
 @numba.njit(cache=True, nogil=True)
-def _demeaned_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop):  # type: ignore[no-untyped-def]
+def _demeaned_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop, scratch):  # type: ignore[no-untyped-def]
     """The bound of a block with an offset per component integrated out, compared with `stop` now and then."""
     n, c = z.shape
     base, shift, height, width = level
-    low, high, weight = np.empty((c, n)), np.empty((c, n)), np.empty((c, n))
-    logs, ratios = 0.0, np.zeros(c)
+    low, high, weight, ratios = scratch[0], scratch[1], scratch[2], scratch[3, :, 0]
+    logs = 0.0
+    ratios[:] = 0.0
     check, total = 3, cost
     for k in range(n):
         at = _record(j + row[k], i + column[k], base, shift, height, width)
@@ -193,12 +190,14 @@ def block_bounds(  # type: ignore[no-untyped-def]
 
     ladder (kinds of noise, c, steps, 2) variances and their logs; level = (base, shift, height, width) of the records.
     """
-    found = np.empty(len(blocks))
+    found, scratch = np.empty(len(blocks)), np.empty((4, z.shape[2], z.shape[1]))
     for p in range(len(blocks)):
         h, j, i = blocks[p, 0], blocks[p, 1], blocks[p, 2]
         base = heading_cost[h] + _distance_cost(j, i, side, prior)
         if demeaned:
-            bound = _demeaned_bound(j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop)
+            bound = _demeaned_bound(
+                j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop, scratch
+            )
         else:
             bound = _raw_bound(j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop)
         found[p] = bound - _SLACK * (1.0 + abs(bound))

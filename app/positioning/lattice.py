@@ -17,7 +17,7 @@ from app.positioning.window import Window
 __all__ = ["ReducedWindow", "Turned", "effective_samples", "heading_lattice", "reduce_window", "turn_window"]
 
 MIN_HEADINGS, MAX_HEADINGS = 72, 720
-_DECORRELATED = 0.15
+_DECORRELATED = 0.1
 _HEADING_PRIOR_SDS = 4.5  # how far a heading prior is searched
 
 
@@ -103,7 +103,7 @@ def effective_samples(path_m: Array, correlation_m: float) -> float:
     """How many independent samples a window is worth, at least 1 and at most as many as it has.
 
     A position follows from differences of the field along the walk, whose errors decorrelate several times faster than
-    the errors themselves: a seventh of the correlation length is what calibrates (benchmarks/calibration.py).
+    the errors themselves: a tenth of the correlation length is what calibrates (benchmarks/calibration.py).
     """
     n = float(len(path_m))
     if correlation_m <= 0.0:

@@ -70,7 +70,7 @@ def match(
     reduced = reduce_window(window, components, min(plane.resolution_m for plane in planes))
     correlation = max(floor.grid.error_correlation_m for floor in floors)
     temper = len(reduced) / effective_samples(reduced.path_m, correlation)
-    headings = heading_lattice(window, _heading_step(reduced, planes, temper))
+    headings = heading_lattice(window, _heading_step(reduced, planes, temper, demeaned))
     pose_prior = PosePrior(
         prior.position_m if prior else None, prior.sd_m if prior else 1.0, _heading_log(window, headings)
     )
@@ -113,14 +113,15 @@ def device_turn_rad(window: Window) -> float:
     return float(np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end))
 
 
-def _heading_step(window: ReducedWindow, planes: Sequence[Plane], temper: float) -> float:
+def _heading_step(window: ReducedWindow, planes: Sequence[Plane], temper: float, demeaned: bool) -> float:
     """A step at which the pose between two headings of the lattice loses at most `_HEADING_LOSS_NATS`, tempered."""
     centred = window.from_last_m - window.from_last_m.mean(axis=0)
     lever = np.sum(np.square(centred), axis=1)
     steepest = max(plane.gradient_uT_per_m for plane in planes)
     change = 0.5 * steepest**2 * lever  # squared, per radian
     if window.turns:
-        change = change + np.sum(np.square(window.features_uT[:, :2]), axis=1)
+        turning = window.features_uT[:, :2] - (window.features_uT[:, :2].mean(axis=0) if demeaned else 0.0)
+        change = change + np.sum(np.square(turning), axis=1)
     least = min(float(plane.pyramid.ladder_uT2[:, 0].min()) for plane in planes)
     information = float(np.sum(change / (least + window.noise_variance_uT2))) / temper
     widest = 2.0 * np.sqrt(2.0 * _HEADING_LOSS_NATS / max(information, 1e-12))

@@ -20,8 +20,9 @@ __all__ = ["CAPACITY", "Candidates", "PosePrior", "search"]
 
 Blocks = NDArray[np.int32]
 CAPACITY = 400_000  # poses kept at most
-_BLOCKS_PER_POSE = 5  # how many blocks of a level may be followed, per pose of the capacity
+_BLOCKS_PER_POSE = 2  # how many blocks of a level may be followed, per pose of the capacity
 _BEAM = 48
+_DEMEANED_TOP_LEVEL = 3  # larger blocks than this an offset nearly always explains
 _DIVE_AGAIN = 1500  # blocks of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _SPARE_NATS = 12.0  # tempered: how far beyond the limit a bound is followed, so that the missed mass comes out small
@@ -70,6 +71,7 @@ class _PlaneCosts:
         turned = turn_window(window, headings_rad, plane.resolution_m)
         order = telling_order(window, plane)
         self.plane, self.demeaned, self.headings = plane, demeaned, len(headings_rad)
+        self.top = _DEMEANED_TOP_LEVEL if demeaned else TOP_LEVEL
         self.z = np.ascontiguousarray(turned.features_uT[:, order])
         self.row = np.ascontiguousarray(turned.offset_cells[:, order, 0])
         self.column = np.ascontiguousarray(turned.offset_cells[:, order, 1])
@@ -108,7 +110,7 @@ class _PlaneCosts:
 
     def top_blocks(self) -> Blocks:
         ny, nx = self.plane.shape
-        side = 1 << TOP_LEVEL
+        side = 1 << self.top
         h, j, i = np.meshgrid(np.arange(self.headings), np.arange(0, ny, side), np.arange(0, nx, side), indexing="ij")
         return np.stack([h.ravel(), j.ravel(), i.ravel()], axis=1).astype(np.int32)
 
@@ -174,11 +176,11 @@ class _Sweep:
         blocks, bounds, seed, seed_cost = start.blocks, start.bounds, start.seed, start.seed_cost
         if self._stop() > start.followed_to:
             again = bounds <= self._stop()
-            bounds[again] = on_plane.bounds(blocks[again], TOP_LEVEL, self._stop())
-        for level in range(TOP_LEVEL, 0, -1):
-            if level < TOP_LEVEL:
+            bounds[again] = on_plane.bounds(blocks[again], on_plane.top, self._stop())
+        for level in range(on_plane.top, 0, -1):
+            if level < on_plane.top:
                 bounds = on_plane.bounds(blocks, level, self._stop())
-            if level < TOP_LEVEL and len(blocks) > _DIVE_AGAIN:
+            if level < on_plane.top and len(blocks) > _DIVE_AGAIN:
                 pose, cost = _dive(on_plane, blocks, bounds, level)
                 seed, seed_cost = (pose, cost) if cost < seed_cost else (seed, seed_cost)
                 self._improve(cost)
@@ -246,8 +248,8 @@ class _Start:
 def _start(on_plane: _PlaneCosts, expected: float) -> _Start:
     """Bound the top blocks as far as a matching window needs it, and follow the most promising down to a pose."""
     top = on_plane.top_blocks()
-    top_bounds = on_plane.bounds(top, TOP_LEVEL, expected)
-    seed, seed_cost = _dive(on_plane, top, top_bounds, TOP_LEVEL)
+    top_bounds = on_plane.bounds(top, on_plane.top, expected)
+    seed, seed_cost = _dive(on_plane, top, top_bounds, on_plane.top)
     return _Start(top, top_bounds, expected, seed, seed_cost)
 
 

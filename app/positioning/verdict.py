@@ -116,6 +116,11 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
 
 
 def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[Status, str | None]:
+    if belief.missed > 0.5:
+        return "ambiguous", (
+            "the window matches so many places that not all of them were weighed; walk further, or send a prior "
+            "position or heading"
+        )
     scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if matched.demeaned else 0)
     distance2 = belief.best.distance2 / matched.temper
     limit = chi_square_limit(scalars / matched.temper, options.gate_probability)
