@@ -16,7 +16,7 @@ def ours(_item: object, _name: str | None, kind: str, reflected: bool, compared_
 
 
 def render(kind: str, item: Any, _context: object) -> str | bool:
-    """Write our own types into migrations as what they are in the database: a migration must not change with the code."""
+    """Write our own types as what they are in the database: a migration must not change with the code."""
     return "sa.DateTime(timezone=True)" if kind == "type" and isinstance(item, UtcDateTime) else False
 
 
