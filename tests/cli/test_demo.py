@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from app.cli import main
 from app.cli.demo.journey import Answer
+from app.cli.demo.pictures import draw_errors
 from app.cli.demo.report import absurdities, judge, summary
 from app.cli.demo.server import DemoError, clean_folder, running_server
 from app.cli.demo.synthetic import synthetic_world
@@ -96,6 +97,7 @@ def test_the_server_stays_until_the_demo_is_terminated(tmp_path: Path) -> None:
     try:
         url = _address(process, tmp_path / "told")
         assert httpx.get(f"{url}/readyz").status_code == 200
+        assert "text/html" in httpx.get(f"{url}/view/", follow_redirects=True).headers["content-type"]
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(60)
@@ -169,9 +171,17 @@ def test_an_absurd_result_is_called_absurd() -> None:
     good = judge([_answer(0.2, 0.5)] * 10, ["ground"])
     assert absurdities(known, [], good) == []
     over_confident = judge([_answer(0.6, 0.5)] * 10, ["ground"])
-    assert "95 % radius holds only 0%" in absurdities(known, [], over_confident)[0]
+    assert "95 % radius holds only 0 of 10" in absurdities(known, [], over_confident)[0]
+    unlucky = judge([_answer(0.2, 0.5)] * 6 + [_answer(0.6, 0.5)] * 2, ["ground"])
+    assert absurdities(known, [], unlucky) == []
     lost = judge([_answer(4.0, 20.0)] * 10, ["ground"])
     assert "worse than 1 m" in absurdities(known, [], lost)[0]
     real = World("w", [], [])
     assert absurdities(real, [], lost) == []
     assert absurdities(real, [], []) == ["no window was located"]
+
+
+@pytest.mark.parametrize("answers", [[], [_answer(0.2, 0.5), _answer(3.0, 0.5), _answer(0.1, 0.5, floor_id="upper")]])
+def test_errors_are_drawn_whatever_they_are(tmp_path: Path, answers: list[Answer]) -> None:
+    draw_errors(tmp_path / "errors.png", judge(answers, ["ground", "upper"]), "errors")
+    assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")

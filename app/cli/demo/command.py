@@ -90,7 +90,9 @@ def _show(console: Console, api: "Connection", world: "World", folder: Path) -> 
         answers = ask(api, building_id, world.questions, told)
     judged = reporting.judge(answers, floor_ids)
     console.print(*(f"[dim]{note}[/dim]" for note in world.notes), sep="\n")
-    console.print(reporting.map_table(floors), *reporting.position_tables(judged), reporting.status_line(answers))
+    console.print(
+        reporting.map_table(floors), *reporting.position_tables(judged), reporting.status_line(answers, judged)
+    )
     document = reporting.report(world, floors, answers, judged)
     (folder / "report.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
     _draw(console, api, folder, floors, answers, judged)

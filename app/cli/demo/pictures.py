@@ -144,31 +144,37 @@ def _scale_bar(axes: "Axes", extent: tuple[float, float, float, float]) -> None:
 
 
 def _draw_calibration(axes: "Axes", beliefs: list[Judged]) -> None:
-    """One point per window: right of the line the stated radius held."""
-    lengths = sorted({each.answer.question.length_m for each in beliefs})
+    """One point per window, hollow unless the server called it a fix; below the line the stated radius held."""
     answered = [each for each in beliefs if each.error_m is not None]
-    finite = [each.error_m for each in answered if each.error_m is not None and np.isfinite(each.error_m)]
-    radii = np.array([each.radius_95_m for each in answered])
-    low, high = 0.5 * max(min([*finite, 0.1]), 0.01), 2.0 * max([*finite, 1.0])
-    narrow, wide = 0.7 * float(radii.min()), 1.5 * float(radii.max())
-    for length_m, colour, marker in zip(lengths, _COLOURS, _MARKERS, strict=False):
-        mine = [each for each in answered if each.answer.question.length_m == length_m]
-        right = np.array([[each.radius_95_m, each.error_m] for each in mine if each.right_floor]).reshape(-1, 2)
-        wrong = np.array([each.radius_95_m for each in mine if not each.right_floor])
-        style: dict[str, Any] = {"color": colour, "marker": marker, "ls": "", "ms": 6, "mec": "white", "mew": 0.6}
-        axes.plot(right[:, 0], np.maximum(right[:, 1], low), label=f"{length_m:g} m walked", **style)
-        axes.plot(wrong, np.full(len(wrong), high / 1.25), **(style | {"mec": "black", "mew": 1.2}))
+    errors = np.array([np.inf if each.error_m is None else each.error_m for each in answered])
+    radii = np.maximum([each.radius_95_m for each in answered], 0.01)
+    finite = errors[np.isfinite(errors)]
+    low, high = 0.5 * max(float(finite.min(initial=0.1)), 0.01), 2.0 * float(finite.max(initial=1.0))
+    narrow, wide = 0.7 * float(radii.min(initial=1.0)), 1.5 * float(radii.max(initial=1.0))
+    shown = np.where(np.isfinite(errors), np.maximum(errors, low), high / 1.25)
+    lengths = np.array([each.answer.question.length_m for each in answered])
+    called_fix = np.array([each.answer.fix["status"] == "fix" for each in answered], dtype=bool)
+    for length_m, colour, marker in zip(np.unique(lengths), _COLOURS, _MARKERS, strict=False):
+        style: dict[str, Any] = {"color": colour, "marker": marker, "ls": "", "ms": 6}
+        for fix, face in ((True, colour), (False, "none")):
+            mine = (lengths == length_m) & (called_fix == fix)
+            axes.plot(radii[mine], shown[mine], mfc=face, **style)
+        axes.plot([], [], label=f"{length_m:g} m walked", **style)
     line = [min(low, narrow), max(high, wide)]
     axes.plot(line, line, color="black", lw=1.0)
     axes.fill_between(line, line, line[0], color=GREEN, alpha=0.08, lw=0)
     axes.text(0.97, 0.04, "stated radius held", transform=axes.transAxes, ha="right", fontsize=9, color="#00664b")
+    if len(finite) < len(errors):
+        axes.axhline(high / 1.6, color="black", lw=0.6, ls=":")
+        axes.text(narrow * 1.05, high / 1.3, "wrong floor", va="center", fontsize=8)
     axes.set(xscale="log", yscale="log", xlim=(narrow, wide), ylim=(low, high))
     _plain_ticks(axes.xaxis)
     _plain_ticks(axes.yaxis)
     axes.set(xlabel="stated 95 % radius (m)", ylabel="true error (m)")
-    held = np.mean([each.error_m is not None and each.error_m <= each.radius_95_m for each in answered])
-    axes.set_title(f"{held:.0%} of {len(answered)} windows within their 95 % radius", fontsize=10)
-    axes.legend(loc="best", fontsize=8, title="black edge, at the top: wrong floor", title_fontsize=8)
+    share = f"{np.mean(errors <= radii):.0%} of " if len(errors) else ""
+    axes.set_title(f"{share}{len(answered)} windows within their stated 95 % radius", fontsize=10)
+    if len(answered):
+        axes.legend(loc="best", fontsize=8, title="hollow: not called a fix", title_fontsize=8)
     axes.grid(which="both", color="#d9d9d9", lw=0.4)
 
 
@@ -197,5 +203,5 @@ def _draw_shares(axes: "Axes", judged: list[Judged]) -> None:
     axes.set(xlabel="true error (m)", ylabel="windows placed within that distance (%)")
     _plain_ticks(axes.xaxis)
     axes.set_title("Share of all windows asked; a technique that declines ends below 100 %", fontsize=10)
-    axes.legend(loc="lower right", fontsize=8)
+    axes.legend(loc="best", fontsize=8)
     axes.grid(which="both", color="#d9d9d9", lw=0.4)
