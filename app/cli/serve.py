@@ -1,6 +1,7 @@
 """`isodyn serve`, `isodyn worker` and `isodyn openapi`."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -49,10 +50,9 @@ def serve(
 
 def worker() -> None:
     """Run one worker: it takes jobs from the database until it is stopped."""
-    from workers.main import run_worker
-
     from app.main import first_start
     from app.settings import Settings
+    from workers.main import run_worker
 
     settings = Settings()
     first_start(settings)
@@ -106,6 +106,9 @@ class WorkerSupervisor:
     def _watch(self) -> None:
         while not self._stopping.is_set():
             with self._lock:
-                self._process = subprocess.Popen([sys.executable, "-m", "workers", "--exit-with-parent"])
+                # A session of its own: Ctrl-C in the terminal is the server's to hear, and it then asks the worker.
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "workers", "--exit-with-parent", str(os.getpid())], start_new_session=True
+                )
             self._process.wait()
             self._stopping.wait(RESTART_AFTER_S)

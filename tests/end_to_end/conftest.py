@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -53,23 +54,22 @@ class Server:
                 time.sleep(0.05)
         raise AssertionError((self.folder / "server.log").read_text())
 
-    def worker_pids(self) -> list[int]:
-        """The worker processes that belong to this server's process group, and their fit processes."""
-        assert self.process is not None
+    def pids(self, word: bytes = b"") -> list[int]:
+        """Every process that works on this server's data folder, of those whose command has the word."""
+        mine = f"ISODYN_DATA_DIR={self.environment['ISODYN_DATA_DIR']}".encode()
         found = []
-        for path in Path("/proc").glob("[0-9]*/cmdline"):
-            try:
-                words = path.read_bytes().split(b"\0")
-                if b"workers" in words and os.getpgid(int(path.parent.name)) == self.process.pid:
-                    found.append(int(path.parent.name))
-            except (OSError, ProcessLookupError):
-                continue
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                if mine in (folder / "environ").read_bytes() and word in (folder / "cmdline").read_bytes():
+                    found.append(int(folder.name))
         return found
 
     def kill(self) -> None:
         """kill -9 of the server and everything it started."""
         assert self.process is not None
-        os.killpg(self.process.pid, signal.SIGKILL)
+        for pid in self.pids():
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
         self.process.wait()
 
     def stop(self) -> int:
@@ -103,8 +103,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
     server.start()
     yield server
     server.http.close()
-    if server.process is not None and server.process.poll() is None:
-        server.kill()
+    server.kill()
 
 
 @pytest.fixture(scope="session")

@@ -85,7 +85,7 @@ def test_a_stream_of_uploads_with_kills_loses_nothing_acknowledged(
 
 
 def test_ctrl_c_ends_everything(server: Any) -> None:
-    pids = server.worker_pids()
+    pids = server.pids(b"workers")
     assert pids
     assert server.stop() in (0, 130, -signal.SIGINT)
     for _ in range(100):
