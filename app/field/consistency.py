@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from scipy.special import betainc, chdtrc
 
 from app.field.leave_one_out import HeldOut
+from app.field.noise_calibration import NOMINAL_COVERAGE
 from app.field.spec import ComponentConsistency, ConsistencyReport, SegmentConsistency
 from app.geometry import Array
 
 __all__ = ["MIN_JUDGED", "check_consistency", "check_surveys"]
 
 SEED_COVERAGE = 0.96
-NOMINAL_COVERAGE = 0.9545
 CHANCE = 1e-4
 """Below this probability a low coverage, or a large mean square, is no longer put down to chance."""
 

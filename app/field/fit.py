@@ -12,6 +12,7 @@ from app.field.grid import FieldGrid
 from app.field.hilbert_engine import estimate_by_hilbert
 from app.field.leave_one_out import HeldOut, error_correlation_m, score
 from app.field.measured import measured_cells, near_other_walks
+from app.field.noise_calibration import noise_sd_by_survey, noise_sd_shown
 from app.field.observations import Walk, observe
 from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import Engine, FittedMap, MapSpec, Progress
@@ -40,8 +41,7 @@ def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _s
     ambient_uT = np.median(np.concatenate([walk.field_uT for walk in observed]), axis=0)
     estimate = _ENGINES[spec.engine](observed, ambient_uT, spec, height_m, lambda f, text: progress(0.9 * f, text))
     progress(0.9, "scoring the map by leaving each survey out")
-    noise_sd_uT = _noise_sd_uT(observed, estimate.error_sd_uT)
-    held_out = _held_out(observed, estimate, ambient_uT, noise_sd_uT)
+    held_out, noise_sd_uT = _held_out(observed, estimate, ambient_uT)
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out)
     names = COMPONENT_NAMES[spec.components]
@@ -68,28 +68,28 @@ def _single_height(spec: MapSpec) -> float | None:
     return spec.heights_m[0]
 
 
-def _noise_sd_uT(walks: Sequence[Walk], error_sd_uT: Array) -> Array:
-    """(c,) sd of one further sample about the field: error of an observation, and scatter of samples about it."""
-    scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
-    return np.asarray(np.sqrt(np.square(error_sd_uT) + scatter_uT2))
-
-
-def _held_out(
-    walks: Sequence[Walk], estimate: FieldEstimate, ambient_uT: Array, noise_sd_uT: Array
-) -> dict[str, HeldOut]:
+def _held_out(walks: Sequence[Walk], estimate: FieldEstimate, ambient_uT: Array) -> tuple[dict[str, HeldOut], Array]:
+    """Every survey against the map of the others, and the noise sd (c,) of one further measurement."""
     near = near_other_walks(walks)
-    held_out: dict[str, HeldOut] = {}
+    error_uT, latent_uT2, needed_uT2 = {}, {}, {}
     for walk in walks:
         name, stretch = walk.survey_id, walk.stretch_of_sample
-        predicted_uT = ambient_uT + estimate.held_out_mean_uT[name]
-        latent_uT2 = estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT)
-        held_out[name] = HeldOut(
-            error_uT=walk.sample_field_uT - predicted_uT[stretch],
-            sd_uT=np.sqrt(latent_uT2 + np.square(noise_sd_uT))[stretch],
-            judged=near[name],
-            path_m=walk.path_m[stretch],
+        error_uT[name] = walk.sample_field_uT - (ambient_uT + estimate.held_out_mean_uT[name])[stretch]
+        latent_uT2[name] = (estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT))[stretch]
+        needed_uT2[name] = (np.square(error_uT[name]) / 4.0 - latent_uT2[name])[near[name]]
+    scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
+    believed_sd_uT = np.sqrt(np.square(estimate.error_sd_uT) + scatter_uT2)
+    shown_sd_uT = noise_sd_by_survey(needed_uT2, believed_sd_uT)
+    held_out = {
+        walk.survey_id: HeldOut(
+            error_uT=error_uT[walk.survey_id],
+            sd_uT=np.sqrt(latent_uT2[walk.survey_id] + np.square(shown_sd_uT[walk.survey_id])),
+            judged=near[walk.survey_id],
+            path_m=walk.path_m[walk.stretch_of_sample],
         )
-    return held_out
+        for walk in walks
+    }
+    return held_out, noise_sd_shown(list(needed_uT2.values()), believed_sd_uT)
 
 
 def _grid(

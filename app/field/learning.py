@@ -6,7 +6,7 @@ rest from the statistics, starting where the best trial so far ended.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -29,7 +29,7 @@ LEARNABLE = (8.0, 1.0)
 GOOD_ENOUGH = 1.5
 """A lattice whose pitch is within this factor of the suited one learns the same length."""
 
-FAINT_WALK_NOISE = WalkNoise(variance_ratio=0.3, length_m=1.5)
+TRIED_FIRST = (WalkNoise(variance_ratio=0.3, length_m=1.5), WalkNoise(variance_ratio=10.0, length_m=5.0))
 WORTH_NATS = 0.02
 """Errors are taken to be correlated along a walk when that gains this log likelihood per observation and component."""
 MAX_TRIALS = 20
@@ -93,10 +93,11 @@ def learn_hyperparameters(
 
 def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:
     """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
-    best = learner.learn(FAINT_WALK_NOISE, white.log_parameters)
+    first = [learner.learn(noise, white.log_parameters) for noise in TRIED_FIRST]
+    best = min(first, key=lambda learned: learned.nats)
     if best.nats > white.nats - WORTH_NATS:
         return white
-    centre, step = np.log([FAINT_WALK_NOISE.variance_ratio, FAINT_WALK_NOISE.length_m]), np.log([4.0, 2.0])
+    centre, step = np.log(astuple(TRIED_FIRST[first.index(best)])), np.log([4.0, 2.0])
     direction, failures = 0, 0
     for trial in range(MAX_TRIALS):
         progress(0.5 + 0.5 * trial / MAX_TRIALS, "learning the errors along a walk")

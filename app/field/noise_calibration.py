@@ -1,0 +1,40 @@
+"""The sd of one further measurement about the map, as held-out errors show it.
+
+A likelihood believes its model of the noise; errors of surveys against the map of the others show what a new survey
+will meet: labels off by a metre, hard iron, a phone in another hand. The noise is set so that two predictive sds cover
+as much of them as a Gaussian should (Kuevor B14 asks the same of every log); each survey is scored with the noise the
+*other* surveys show, so that the score stays honest.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from app.geometry import Array
+
+__all__ = ["NOMINAL_COVERAGE", "noise_sd_by_survey", "noise_sd_shown"]
+
+NOMINAL_COVERAGE = 0.9545
+FEWEST_SURVEYS = 3
+FEWEST_SAMPLES = 200
+
+
+def noise_sd_shown(needed_uT2: Sequence[Array], believed_sd_uT: Array) -> Array:
+    """(c,) noise sd that covers held-out errors as it should; what was believed, when too few were held out.
+
+    needed_uT2: per survey (n, c), the noise variance with which each judged error would lie at two predictive sds:
+    `error^2 / 4 - latent variance`.
+    """
+    judged = [needed for needed in needed_uT2 if len(needed)]
+    if len(judged) < FEWEST_SURVEYS or sum(map(len, judged)) < FEWEST_SAMPLES:
+        return believed_sd_uT
+    variance_uT2 = np.quantile(np.concatenate(judged), NOMINAL_COVERAGE, axis=0)
+    return np.asarray(np.sqrt(np.maximum(variance_uT2, np.square(0.1 * believed_sd_uT))))
+
+
+def noise_sd_by_survey(needed_uT2: Mapping[str, Array], believed_sd_uT: Array) -> dict[str, Array]:
+    """Survey id -> (c,) noise sd that the other surveys show."""
+    return {
+        survey_id: noise_sd_shown([n for other, n in needed_uT2.items() if other != survey_id], believed_sd_uT)
+        for survey_id in needed_uT2
+    }

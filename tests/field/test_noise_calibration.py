@@ -1,0 +1,28 @@
+import numpy as np
+import pytest
+
+from app.field.noise_calibration import noise_sd_by_survey, noise_sd_shown
+
+BELIEVED = np.array([0.1, 5.0])
+
+
+def needed(rng, noise_sd, surveys=4, n=3000, latent=0.25):
+    errors = {str(s): rng.normal(0.0, np.sqrt(latent + np.square(noise_sd)), (n, 2)) for s in range(surveys)}
+    return {name: np.square(e) / 4.0 - latent for name, e in errors.items()}
+
+
+def test_noise_is_what_held_out_errors_show_whatever_was_believed():
+    shown = noise_sd_shown(list(needed(np.random.default_rng(0), 1.0).values()), BELIEVED)
+    assert shown == pytest.approx([1.0, 1.0], rel=0.05)
+
+
+def test_few_surveys_leave_the_belief_alone():
+    few = needed(np.random.default_rng(0), 1.0, surveys=2)
+    assert np.array_equal(noise_sd_shown(list(few.values()), BELIEVED), BELIEVED)
+    assert np.array_equal(noise_sd_shown([np.zeros((0, 2))] * 5, BELIEVED), BELIEVED)
+
+
+def test_a_survey_is_not_scored_with_its_own_errors():
+    all_needed = needed(np.random.default_rng(0), 1.0)
+    all_needed["0"] = all_needed["0"] + 100.0
+    assert noise_sd_by_survey(all_needed, BELIEVED)["0"] == pytest.approx([1.0, 1.0], rel=0.05)
