@@ -17,7 +17,7 @@ from app.positioning.window import Window
 __all__ = ["ReducedWindow", "Turned", "effective_samples", "heading_lattice", "reduce_window", "turn_window"]
 
 MIN_HEADINGS, MAX_HEADINGS = 72, 720
-_DECORRELATED = 0.1
+DECORRELATED_SHARE = 0.12
 _HEADING_PRIOR_SDS = 4.5  # how far a heading prior is searched
 
 
@@ -99,16 +99,17 @@ def turn_window(window: ReducedWindow, headings_rad: Array, resolution_m: float)
     return Turned(features, offsets)
 
 
-def effective_samples(path_m: Array, correlation_m: float) -> float:
+def effective_samples(path_m: Array, correlation_m: float, share: float = DECORRELATED_SHARE) -> float:
     """How many independent samples a window is worth, at least 1 and at most as many as it has.
 
-    A position follows from differences of the field along the walk, whose errors decorrelate several times faster than
-    the errors themselves: a tenth of the correlation length is what calibrates (benchmarks/calibration.py).
+    One per `share` of the correlation length walked. A position follows from differences of the field along the walk,
+    whose errors decorrelate several times faster than the errors themselves: the default is what calibrates
+    (benchmarks/calibration.py).
     """
     n = float(len(path_m))
     if correlation_m <= 0.0:
         return n
-    return min(n, 1.0 + float(path_m[-1] - path_m[0]) / (_DECORRELATED * correlation_m))
+    return min(n, 1.0 + float(path_m[-1] - path_m[0]) / (share * correlation_m))
 
 
 def _group_means(values: Array, group: NDArray[np.int64], count: NDArray[np.int64]) -> Array:

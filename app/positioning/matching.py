@@ -26,6 +26,7 @@ __all__ = ["Matched", "device_turn_rad", "match"]
 
 _KEPT_NATS = 10.0  # tempered: poses this much less likely than the best are left out of the belief
 _HEADING_LOSS_NATS = 1.0  # tempered: what a heading midway between two of the lattice may cost
+_GATE_SHARE = 2.0  # squares of residuals add one independent term per two correlation lengths
 _COURSE_M = 1.0  # the stretch over which a course is taken
 
 
@@ -34,7 +35,8 @@ class Matched:
     """A window matched with floors.
 
     floors, planes     planes[k] belongs to floors[plane_floor[k]]
-    window             as it was matched; `temper` = its samples / what they are worth as independent ones
+    window             as it was matched; `temper` = its samples / what they are worth as independent ones for a
+                       position, `gate_temper` the same for the squares of their residuals
     headings_rad       (h,) yaws of the window's frame; `device_turn_rad` is added for the device's heading at the last
                        sample (None: a building window has no heading to tell)
     candidates         poses of the lattice; position_m (n, 2) of the last sample
@@ -47,6 +49,7 @@ class Matched:
     plane_floor: NDArray[np.int64]
     window: ReducedWindow
     temper: float
+    gate_temper: float
     demeaned: bool
     headings_rad: Array
     device_turn_rad: float | None
@@ -84,6 +87,7 @@ def match(
         plane_floor=np.array([k for k, floor in enumerate(floors) for _ in floor.planes]),
         window=reduced,
         temper=temper,
+        gate_temper=len(reduced) / effective_samples(reduced.path_m, correlation, _GATE_SHARE),
         demeaned=demeaned,
         headings_rad=headings,
         device_turn_rad=None if window.frame == "building" else device_turn_rad(window),

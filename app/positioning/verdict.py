@@ -122,8 +122,8 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
             "position or heading"
         )
     scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if matched.demeaned else 0)
-    distance2 = belief.best.distance2 / matched.temper
-    limit = chi_square_limit(scalars / matched.temper, options.gate_probability)
+    distance2 = belief.best.distance2 / matched.gate_temper
+    limit = chi_square_limit(scalars / matched.gate_temper, options.gate_probability)
     unlike_any_field = belief.off_map_distance2 > chi_square_limit(belief.off_map_scalars, options.gate_probability)
     if belief.unmapped > 0.5 and not (unlike_any_field and distance2 > limit):
         return "unmapped", (
