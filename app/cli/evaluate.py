@@ -138,8 +138,8 @@ def _technique_table(summaries: "list[Summary]") -> Table:
         for name, technique in summary.techniques.items():
             percentiles = " / ".join(_metres(x) for x in technique.error_percentiles_m.values())
             table.add_row(
-                length, ground, name, str(technique.available), str(technique.right_floor), str(technique.within_2_m),
-                str(technique.within_5_m), percentiles,
+                length, ground, name.replace("_", " "), str(technique.available), str(technique.right_floor),
+                str(technique.within_2_m), str(technique.within_5_m), percentiles,
             )  # fmt: skip
     return table
 

@@ -79,7 +79,10 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class JudgedWindow:
-    """One window of a held-out walk and what each technique made of it; None where a technique did not answer."""
+    """One window of a held-out walk and what each technique made of it; None where a technique did not answer.
+
+    All techniques search every floor, but `ml_floor_known`: maximum likelihood on the right floor alone.
+    """
 
     floor_id: str
     walk: str
@@ -87,6 +90,7 @@ class JudgedWindow:
     covered: bool
     status: str
     ml: Place | None
+    ml_floor_known: Place | None
     mlr: Place | None
     abl: Place | None
     posterior: Place | None
@@ -282,16 +286,20 @@ def _judge_walk(floor_id: str, name: str, walk: Walk, mapped_m: Array) -> list[J
     p_m = walk.samples.p_building_m[:, :2]
     distance_m, _ = cKDTree(mapped_m).query(p_m)
     near = np.asarray(distance_m) <= COVERED_WITHIN_M
+    right_floor = [floor for floor in _floors if floor.floor_id == floor_id]
     judged = []
     for length_m in _plan.window_lengths_m:
         for part, window in cut_windows(walk.dead_reckoning, length_m):
             fix = locate(window, _floors, composition=_plan.composition, options=_plan.options)
+            alone = locate(window, right_floor, composition=_plan.composition, techniques=(), options=_plan.options)
             covered = bool(near[part].mean() >= COVERED_SHARE)
-            judged.append(_judge(fix, floor_id, name, length_m, covered, p_m[part][-1]))
+            judged.append(_judge(fix, alone, floor_id, name, length_m, covered, p_m[part][-1]))
     return judged
 
 
-def _judge(fix: Fix, floor_id: str, walk: str, length_m: float, covered: bool, truth_m: Array) -> JudgedWindow:
+def _judge(
+    fix: Fix, alone: Fix, floor_id: str, walk: str, length_m: float, covered: bool, truth_m: Array
+) -> JudgedWindow:
     def place(estimate: Any) -> Place | None:
         if estimate is None or estimate.position_m is None:
             return None
@@ -306,6 +314,7 @@ def _judge(fix: Fix, floor_id: str, walk: str, length_m: float, covered: bool, t
         covered=covered,
         status=fix.status,
         ml=place(fix.ml),
+        ml_floor_known=place(alone.ml),
         mlr=place(fix.mlr) if fix.mlr.available else None,
         abl=place(fix.abl) if fix.abl.available else None,
         posterior=place(belief),

@@ -11,7 +11,7 @@ __all__ = ["Rate", "Summary", "TechniqueSummary", "rate", "summarise"]
 
 NEAR_M, FAR_M = 2.0, 5.0
 PERCENTILES = (50, 75, 90)
-TECHNIQUES = ("ml", "mlr", "abl", "posterior")
+TECHNIQUES = ("ml", "ml_floor_known", "mlr", "abl", "posterior")
 
 
 @dataclass(frozen=True, slots=True)

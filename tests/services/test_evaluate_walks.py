@@ -72,11 +72,11 @@ def trace(floor: int, seed: int) -> bytes:
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory) -> Path:
-    """Two floors of ten walks, some packed, beside things that are no walks."""
+    """Two floors of six walks, some packed, beside things that are no walks."""
     folder = tmp_path_factory.mktemp("building")
     for floor in (0, 1):
         (folder / f"F{floor}").mkdir()
-        for seed in range(10):
+        for seed in range(6):
             data = trace(floor, seed)
             name = f"F{floor}/walk-{seed}.txt"
             if seed % 2:
@@ -94,7 +94,7 @@ def building(tmp_path_factory) -> Path:
 def test_a_known_building_is_evaluated_end_to_end(building, tmp_path):
     report = tmp_path / "report.json"
     result = CliRunner().invoke(
-        _application(), [str(building), "--length", "10", "--length", "20", "--resolution", "0.5",
+        _application(), [str(building), "--length", "10", "--length", "20", "--resolution", "1",
                          "--processes", "1", "--json", str(report)],
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -103,8 +103,8 @@ def test_a_known_building_is_evaluated_end_to_end(building, tmp_path):
     document = json.loads(report.read_text())
     windows = document["evaluation"]["windows"]
     assert {w["floor_id"] for w in windows} == {"F0", "F1"}
-    assert {w["walk"] for w in windows} == {"walk-2", "walk-4", "walk-7", "walk-9"} & {w["walk"] for w in windows}
     assert all(w["covered"] for w in windows)
+    assert {w["walk"] for w in windows} == {"walk-4"}
     long = [w for w in windows if w["length_m"] == 20.0]
     assert np.mean([w["ml"]["right_floor"] and w["ml"]["error_m"] < 2.0 for w in long]) > 0.7
     for floor in document["evaluation"]["floors"]:
@@ -220,7 +220,9 @@ def test_standard_errors_count_walks_not_windows():
 
 def judged(walk, right, error_m, covered=True, status="fix", answers=True):
     place = Place(right, error_m)
-    return JudgedWindow("F", walk, 20.0, covered, status, place, place if answers else None, None, place, 0.5, 2.0, 9.0)
+    return JudgedWindow(
+        "F", walk, 20.0, covered, status, place, place, place if answers else None, None, place, 0.5, 2.0, 9.0
+    )
 
 
 def test_summaries_count_a_wrong_floor_as_infinitely_wrong():
