@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from app.errors import Fault, InvalidInput, InvalidWindow
+from app.field.grid import FieldGrid
 from app.positioning.belief import believe
 from app.positioning.features import common_components
 from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlrEstimate, Prior
@@ -58,8 +59,6 @@ def locate(
 
 def warm_up() -> None:
     """Compile the search kernels (or load them from numba's cache) before the first query has to wait for it."""
-    from app.field.grid import FieldGrid  # a grid is only needed here
-
     cells = np.zeros((1, 20, 20, 3), dtype=np.float32)
     grid = FieldGrid(
         "vector", (0.0, 0.0), 0.5, np.zeros(1), cells, cells + 1, np.zeros((*cells.shape, 2), np.float32),

@@ -47,7 +47,8 @@ class Candidates:
 
     plane, heading, row, column   (n,) indices
     score                         (n,) log L + temper log prior, nats
-    window_nats                   every pose within this of the best is here (smaller than asked when too many are)
+    window_nats                   every pose within this of the best is here; `complete`: as many as asked, not fewer
+                                  because too many qualify
     missed_mass                   at most this much, relative to the best pose's tempered posterior, was left out
     poses                         how many poses the lattice has
     """
@@ -58,6 +59,7 @@ class Candidates:
     column: NDArray[np.int64]
     score: Array
     window_nats: float
+    complete: bool
     missed_mass: float
     poses: int
 
@@ -159,6 +161,7 @@ def search(
         column=poses[order, 2],
         score=-0.5 * cost[order],
         window_nats=0.5 * sweep.window,
+        complete=sweep.window == 2.0 * window_nats,
         missed_mass=sweep.missed_mass,
         poses=len(headings_rad) * sum(p.shape[0] * p.shape[1] for p in planes),
     )

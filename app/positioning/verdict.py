@@ -116,7 +116,7 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
 
 
 def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[Status, str | None]:
-    if belief.missed > 0.5:
+    if belief.missed > 0.5 and not matched.candidates.complete:
         return "ambiguous", (
             "the window matches so many places that not all of them were weighed; walk further, or send a prior "
             "position or heading"

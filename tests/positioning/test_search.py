@@ -71,6 +71,7 @@ def assert_same_as_exhaustive(
     )
     everything = [exhaustive_scores(plane, window, headings, prior, temper, demeaned) for plane in planes]
     best = max(float(scores.max()) for scores in everything)
+    assert found.complete
     assert found.score[0] == pytest.approx(best, abs=1e-6)
     first = everything[found.plane[0]][found.heading[0], found.row[0], found.column[0]]
     assert first == pytest.approx(best, abs=1e-6)
@@ -144,6 +145,7 @@ def test_keeps_within_capacity_and_says_what_it_left(grid_of: Callable, walk_on:
     prior = PosePrior(None, FLAT, np.zeros(len(headings)))
     found = search(planes, window, headings, prior, window_nats=50.0, capacity=400)
     assert 0 < len(found.score) <= 400
+    assert not found.complete
     everything = exhaustive_scores(planes[0], window, headings, prior, 1.0, False)
     left_out = np.exp(everything - found.score[0]).sum() - np.exp(found.score - found.score[0]).sum()
     assert left_out <= found.missed_mass * (1 + 1e-6)
