@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from app.geometry import Array
 
@@ -67,4 +67,4 @@ def peak_over_uniform(mass: Array, cells: int) -> float:
 
 def chi_square_limit(scalars: float, probability: float) -> float:
     """The squared Mahalanobis distance that `scalars` independent measurements exceed with 1 - probability."""
-    return float(chi2.ppf(probability, scalars))
+    return float(2.0 * gammaincinv(scalars / 2.0, probability))

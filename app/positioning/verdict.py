@@ -91,15 +91,19 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
     floor_of = matched.plane_floor[belief.atoms.plane]
     probability = np.bincount(floor_of, weights=belief.atoms.mass, minlength=len(ids))
     strongest = int(np.argmax(probability))
-    top = next(mode for mode in belief.modes if matched.plane_floor[mode.plane] == strongest)
-    points, mass = mixture_points(belief.atoms.on(floor_of == strongest))
-    centre = _mode_mean(points, mass, top.pose[:2])
+    here = belief.atoms.on(floor_of == strongest)
+    heaviest = int(np.argmax(here.mass))
+    peaks = [(mode.plane, mode.pose[:2]) for mode in belief.modes if matched.plane_floor[mode.plane] == strongest]
+    # Modes are the most likely places; a floor may be the strongest by the sum of many lesser ones.
+    plane, peak = peaks[0] if peaks else (int(here.plane[heaviest]), here.position_m[heaviest])
+    points, mass = mixture_points(here)
+    centre = _mode_mean(points, mass, peak)
     r68, r95 = mass_radius(points, mass, centre, (0.68, 0.95))
     off = points - centre
     return Posterior(
         floor_probability={floor_id: float(p) for floor_id, p in zip(ids, probability, strict=True)},
         floor_id=ids[strongest],
-        position_m=_position(matched, top.plane, centre),
+        position_m=_position(matched, plane, centre),
         covariance_m2=np.asarray((mass * off.T) @ off / mass.sum()),
         radius_68_m=r68,
         radius_95_m=r95,

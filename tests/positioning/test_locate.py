@@ -300,3 +300,20 @@ def test_stated_radii_hold_on_data_from_the_model(grid_of: Callable, walk_on: Ca
 
 def test_warm_up_answers() -> None:
     warm_up()
+
+
+def test_the_strongest_floor_may_be_strong_by_area_alone(grid_of: Callable) -> None:
+    """Many even places, each a little worse than the best of another floor, outweigh it together."""
+    small = grid_of(np.random.default_rng(0), (20, 240), field_sd_uT=0.0, noise_sd_uT=0.4, sd_spread=0.0)
+    wide = grid_of(np.random.default_rng(0), (240, 240), field_sd_uT=0.0, noise_sd_uT=0.4, sd_spread=0.0)
+    off_by_a_little = dataclasses.replace(wide, mean_uT=wide.mean_uT + np.float32(0.25))
+    displacement = np.column_stack([np.linspace(0, 1.0, 3), np.zeros((3, 2))])
+    field = np.tile(small.mean_uT[0, 0, 0].astype(float), (3, 1))
+    window = Window("building", field, displacement, 0.4)
+    fix = locate(window, [prepare_floor("small", small), prepare_floor("wide", off_by_a_little)])
+    assert fix.posterior is not None
+    assert fix.posterior.floor_id == "wide"
+    assert fix.ml is not None
+    assert fix.ml.floor_id == "small"
+    assert fix.status == "ambiguous"
+    assert sum(fix.posterior.floor_probability.values()) == pytest.approx(1.0)
