@@ -13,11 +13,19 @@ import pytest
 from sqlalchemy import Engine, create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
+from threadpoolctl import threadpool_limits
 
 from app.blobs import FolderBlobStore
 from app.db.engine import create_database_engine, migrate, session_factory
 
 POSTGRES_URL = os.environ.get("ISODYN_TEST_POSTGRES_URL", "postgresql+psycopg://root@127.0.0.1:5432/postgres")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_blas_thread() -> Iterator[None]:
+    """As in the workers: small matrices are many times slower on several threads than on one."""
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="module")
