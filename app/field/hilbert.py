@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
-from app.field.basis import CosineBasis, VarianceSeries
+from app.field.basis import CosineBasis
 from app.field.hyperparameters import Hyperparameters
 from app.field.kernels import spectral_density
+from app.field.moments import VarianceSeries
 from app.field.statistics import Evidence
 from app.geometry import Array
 
@@ -49,8 +50,7 @@ class TilePosterior:
 
     def on_lattice(self, x_m: Array, y_m: Array) -> LatticeField:
         """The field at the crossings of columns `x_m` and rows `y_m`, axis by axis."""
-        k = self.basis.functions_per_axis
-        by_axis = self.weights_uT.T.reshape(-1, k, k).transpose(0, 2, 1)
+        by_axis = self.basis.by_axis(self.weights_uT)
         x, y = self.basis.along(0, x_m).T, self.basis.along(1, y_m)
         dx, dy = self.basis.slope_along(0, x_m).T, self.basis.slope_along(1, y_m)
         rows, row_slopes = y @ by_axis, dy @ by_axis
@@ -61,29 +61,31 @@ class TilePosterior:
 def posterior(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> TilePosterior:
     """The posterior of one tile given the sum of its surveys' evidence."""
     root, factor = _factor(basis, evidence, hyper)
-    weights_uT = root[:, None] * cho_solve((factor, True), root[:, None] * evidence.target, check_finite=False)
-    lower, info = dpotri(factor, lower=1)
+    scaled, info = dpotrs(factor, root[:, None] * evidence.target, lower=1)
     assert info == 0, info
-    covariance = (lower + np.tril(lower, -1).T) * np.outer(root, root)
-    return TilePosterior(basis, weights_uT, VarianceSeries.of(basis, covariance), hyper.detail_ratio(basis))
+    covariance, info = dpotri(factor, lower=1, overwrite_c=1)
+    assert info == 0, info
+    variance = VarianceSeries.of(basis, covariance, root)
+    return TilePosterior(basis, root[:, None] * scaled, variance, hyper.detail_ratio(basis))
 
 
 def predict(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters, points_m: Array) -> tuple[Array, Array]:
     """`posterior(...).at(points_m)` for a few points: mean (n, c) about the ambient in uT, variance ratio (n,)."""
     root, factor = _factor(basis, evidence, hyper)
-    scaled = (basis.at(points_m) * root).T
-    right = np.column_stack([root[:, None] * evidence.target, scaled])
-    half = solve_triangular(factor, right, lower=True, check_finite=False)
     components = evidence.target.shape[1]
+    right = np.empty((basis.size, components + len(points_m)), order="F")
+    right[:, :components], right[:, components:] = root[:, None] * evidence.target, (basis.at(points_m) * root).T
+    half = dtrsm(1.0, factor, right, lower=1, overwrite_b=1)
     variance = np.sum(np.square(half[:, components:]), axis=0) + hyper.detail_ratio(basis)
     return half[:, components:].T @ half[:, :components], np.minimum(variance, 1.0)
 
 
 def _factor(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> tuple[Array, Array]:
-    """Prior sds (m,) of the weights, and the lower Cholesky factor (m, m) of their scaled posterior precision."""
+    """Prior sds (m,) of the weights, and the Cholesky factor (m, m) of their scaled posterior precision.
+
+    Only its lower triangle is meant.
+    """
     root = np.sqrt(spectral_density(hyper.kernel, basis.frequencies_squared, hyper.length_m))
-    precision = evidence.gram * np.outer(root, root)
-    precision[np.diag_indices_from(precision)] += 1.0
-    factor, info = dpotrf(precision, lower=1, clean=1, overwrite_a=1)
+    factor, info = dpotrf(evidence.scaled_precision(basis, root), lower=1, clean=0, overwrite_a=1)
     assert info == 0, info
     return root, np.asarray(factor)

@@ -9,7 +9,8 @@ from app.field.leave_one_out import HeldOutPrediction
 from app.field.observations import Walk
 from app.field.raster import BlendedField, GridFrame
 from app.field.spec import MapSpec, Progress
-from app.field.statistics import TiledWalks, add_evidence, marginalise
+from app.field.statistics import add_evidence, marginalise
+from app.field.tiled_walks import TiledWalks
 from app.geometry import Array
 
 __all__ = ["estimate_by_hilbert"]

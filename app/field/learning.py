@@ -6,7 +6,7 @@ rest from the statistics, starting where the best trial so far ended.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from app.field.hyperparameters import Hyperparameters
 from app.field.marginal_likelihood import START_LOG, TileStatistics, learn
 from app.field.observations import Walk
 from app.field.spec import Kernel, Progress
-from app.field.statistics import TiledWalks
+from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WHITE, WalkNoise
 from app.geometry import Array
@@ -22,10 +22,12 @@ from app.geometry import Array
 __all__ = ["learn_hyperparameters"]
 
 LEARNING_TILES = 6
-LEARNING_FUNCTIONS = 14
+LEARNING_FUNCTIONS = 15
 ROUNDS = 6
 LEARNABLE = (8.0, 1.0)
 """A tile can tell lengths between an eighth of its pitch (its functions are no finer) and all of it (its size)."""
+LARGE_OFFSET = 0.01
+"""Above this share of the signal's variance offsets and correlated errors are worth wide tiles, to be told from it."""
 GOOD_ENOUGH = 1.5
 """A lattice whose pitch is within this factor of the suited one learns the same length."""
 
@@ -56,19 +58,18 @@ class _Learner:
         self._kernel = kernel
         self._pin_bias = len(walks) == 1
         self._length_bounds_m = (lattice.pitch_m / LEARNABLE[0], lattice.pitch_m / LEARNABLE[1])
-        few = Lattice(lattice.pitch_m, functions_per_axis=LEARNING_FUNCTIONS)
-        self._tiled = TiledWalks(few, walks, ambient_uT)
+        self._tiled = TiledWalks(lattice, walks, ambient_uT)
         self._chosen = _well_walked(self._tiled.counts())
 
     def learn(self, noise: WalkNoise, start_log: Array) -> _Learned:
         tiles = [
-            TileStatistics(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise))
+            TileStatistics.of(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise).values())
             for tile in self._chosen
         ]
         hyper, log_parameters, value = learn(
             tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias
         )
-        count = sum(survey.count for tile in tiles for survey in tile.surveys.values())
+        count = sum(tile.count for tile in tiles)
         return _Learned(hyper, log_parameters, value / (count * len(hyper.signal_sd_uT)))
 
 
@@ -76,19 +77,23 @@ def learn_hyperparameters(
     walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel, progress: Progress
 ) -> tuple[Hyperparameters, Lattice]:
     """Maximum marginal likelihood, and the lattice that suits the length it finds."""
-    lattice = Lattice.for_length(kernel, float(np.exp(START_LOG[0])))
+    lattice = _learning_lattice(kernel, float(np.exp(START_LOG[0])))
     start_log = START_LOG
     for turn in range(ROUNDS):
         progress(0.5 * turn / ROUNDS, "learning length and noise")
         learner = _Learner(lattice, walks, ambient_uT, kernel)
         white = learner.learn(WHITE, start_log)
         start_log = white.log_parameters
-        suited = Lattice.for_length(kernel, white.hyper.length_m)
+        suited = _learning_lattice(kernel, white.hyper.length_m)
         if 1.0 / GOOD_ENOUGH <= suited.pitch_m / lattice.pitch_m <= GOOD_ENOUGH:
             break
         lattice = suited
     hyper = _learn_walk_noise(learner, white, progress).hyper
-    return hyper, Lattice.for_length(kernel, hyper.length_m)
+    return hyper, Lattice.for_length(kernel, hyper.length_m, wide=hyper.bias_ratio + hyper.walk_ratio > LARGE_OFFSET)
+
+
+def _learning_lattice(kernel: Kernel, length_m: float) -> Lattice:
+    return replace(Lattice.for_length(kernel, length_m, wide=True), functions_per_axis=LEARNING_FUNCTIONS)
 
 
 def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:

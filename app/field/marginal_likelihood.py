@@ -6,11 +6,11 @@ the field finer than the functions can only be learned as white error, which err
 Rasmussen & Williams 2006, 5.4.1; statistics as Solin & Sarkka 2020, 3.3.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg.blas import dtrmm
+from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 from scipy.optimize import minimize
 
@@ -18,7 +18,7 @@ from app.field.basis import CosineBasis
 from app.field.hyperparameters import Hyperparameters
 from app.field.kernels import log_spectral_slope, spectral_density
 from app.field.spec import Kernel
-from app.field.statistics import SurveyStatistics
+from app.field.statistics import Gram, SurveyStatistics
 from app.field.walk_noise import WalkNoise
 from app.geometry import Array
 
@@ -33,10 +33,36 @@ START_LOG = np.log([3.0, 1e-2, 1e-3])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TileStatistics:
-    """The surveys of one tile, and the functions they were projected on."""
+    """The sums over the s surveys of one tile that a likelihood needs, and the functions they were projected on.
+
+    gram, target (m, c), energy (c,), log_det_shape, count: totals. offsets (m, s), ones (s,), ones_target (s, c):
+    of every survey.
+    """
 
     basis: CosineBasis
-    surveys: Mapping[str, SurveyStatistics]
+    gram: Gram
+    target: Array
+    energy: Array
+    log_det_shape: float
+    count: int
+    offsets: Array
+    ones: Array
+    ones_target: Array
+
+    @classmethod
+    def of(cls, basis: CosineBasis, surveys: Collection[SurveyStatistics]) -> "TileStatistics":
+        one, *_ = surveys
+        return cls(
+            basis=basis,
+            gram=Gram(np.sum([s.gram.table for s in surveys], axis=0), one.gram.of_moments),
+            target=np.sum([s.target for s in surveys], axis=0),
+            energy=np.sum([s.energy for s in surveys], axis=0),
+            log_det_shape=sum(s.log_det_shape for s in surveys),
+            count=sum(s.count for s in surveys),
+            offsets=np.stack([s.offset for s in surveys], axis=1),
+            ones=np.array([s.ones for s in surveys]),
+            ones_target=np.stack([s.ones_target for s in surveys]),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +120,7 @@ def learn(
         likelihood = negative_log_likelihood(tiles, kernel, log_parameters)
         return likelihood.value / count, likelihood.gradient / count
 
-    count = sum(survey.count for tile in tiles for survey in tile.surveys.values())
+    count = sum(tile.count for tile in tiles)
     start = np.clip(start_log, bounds[:, 0], bounds[:, 1])
     best = minimize(
         objective,
@@ -114,46 +140,43 @@ def learn(
 
 def _tile_terms(tile: TileStatistics, kernel: Kernel, length_m: float, white: float, bias: float) -> _Terms:
     """Energy and log determinant of one tile, with S^(1/2)-scaled weights so that every matrix is I plus something."""
-    surveys = list(tile.surveys.values())
-    root = np.sqrt(spectral_density(kernel, tile.basis.frequencies_squared, length_m))
-    ones = np.array([s.ones for s in surveys])
-    shrink = bias / (white + bias * ones)
-    offsets = root[:, None] * np.stack([s.offset for s in surveys], axis=1)
-    offset_targets = np.stack([s.ones_target for s in surveys])
-    gram = np.sum([s.gram for s in surveys], axis=0) * np.outer(root, root)
-    gram -= (offsets * shrink) @ offsets.T
-    target = root[:, None] * np.sum([s.target for s in surveys], axis=0) - offsets @ (shrink[:, None] * offset_targets)
-    energy = np.sum([s.energy for s in surveys], axis=0) - shrink @ np.square(offset_targets)
+    frequencies_squared = tile.basis.frequencies_squared
+    root = np.sqrt(spectral_density(kernel, frequencies_squared, length_m))
+    shrink = bias / (white + bias * tile.ones)
+    offsets = root[:, None] * tile.offsets
+    weighted = shrink[:, None] * tile.ones_target
+    target = root[:, None] * tile.target - offsets @ weighted
+    energy = tile.energy - np.sum(weighted * tile.ones_target, axis=0)
 
-    precision = gram / white
+    precision = tile.gram.scaled(tile.basis, root / np.sqrt(white))
+    precision = dgemm(-1.0 / white, offsets * shrink, offsets, 1.0, precision, trans_b=1, overwrite_c=1)
     precision[np.diag_indices_from(precision)] += 1.0
-    factor, info = dpotrf(precision, lower=1, clean=1)
+    factor, info = dpotrf(precision, lower=1, clean=1, overwrite_a=1)
     assert info == 0, info
     inverse, _ = dtrtri(factor, lower=1)
     z = inverse.T @ (inverse @ target) / white
-    misfit = energy - 2.0 * np.sum(z * target, axis=0) + np.sum(z * (gram @ z), axis=0)
+    explained = np.sum(z * target, axis=0)
+    misfit = energy - explained - white * np.sum(np.square(z), axis=0)
 
-    count = sum(s.count for s in surveys)
-    variance = np.sum(np.square(inverse), axis=0)
-    own = bias * ones / (white + bias * ones)
-    log_det = 2.0 * np.sum(np.log(np.diagonal(factor))) + count * np.log(white) - np.sum(np.log1p(-own))
-    log_det += sum(s.log_det_shape for s in surveys)
+    variance = np.einsum("ij,ij->j", inverse, inverse)
+    own = bias * tile.ones / (white + bias * tile.ones)
+    log_det = 2.0 * np.sum(np.log(np.diagonal(factor))) + tile.count * np.log(white) - np.sum(np.log1p(-own))
 
-    slope = log_spectral_slope(kernel, tile.basis.frequencies_squared, length_m)
-    shrink_slope = shrink * white / (white + bias * ones)
-    energy_by_shrink = -np.square(offset_targets - offsets.T @ z) / white
-    log_det_by_shrink = -np.sum(np.square(dtrmm(1.0, inverse, offsets, lower=1)), axis=0) / white
+    slope = log_spectral_slope(kernel, frequencies_squared, length_m)
+    shrink_slope = shrink * white / (white + bias * tile.ones)
+    energy_by_shrink = -np.square(tile.ones_target - offsets.T @ z) / white
+    log_det_by_shrink = -np.sum(np.square(inverse @ offsets), axis=0) / white
     energy_by_bias, log_det_by_bias = shrink_slope @ energy_by_shrink, shrink_slope @ log_det_by_shrink
     return _Terms(
-        energy=(energy - np.sum(z * target, axis=0)) / white,
-        log_det=float(log_det),
+        energy=(energy - explained) / white,
+        log_det=float(log_det) + tile.log_det_shape,
         energy_slope=np.stack([-slope @ np.square(z), -misfit / white - energy_by_bias, energy_by_bias]),
         log_det_slope=np.array(
             [
                 slope @ (1.0 - variance),
-                count - (len(root) - np.sum(variance)) - np.sum(own) - log_det_by_bias,
+                tile.count - (len(root) - np.sum(variance)) - np.sum(own) - log_det_by_bias,
                 np.sum(own) + log_det_by_bias,
             ]
         ),
-        count=count,
+        count=tile.count,
     )

@@ -6,27 +6,39 @@ survey's constant offset inside the tile, of prior variance `bias_ratio` beside 
 integrated out in closed form afterwards (Sherman-Morrison), so offsets cost nothing and no sample is read again.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg.blas import dsyrk
+from scipy.linalg.blas import dgemm, dsyrk
 
 from app.field.basis import CosineBasis
-from app.field.observations import Walk
-from app.field.tiles import Lattice, Tile
-from app.field.walk_noise import WalkNoise, whiten
+from app.field.moments import cosines, gram_of_moments
+from app.field.walk_noise import WHITE, WalkNoise, whiten
 from app.geometry import Array
 
-__all__ = ["Evidence", "SurveyStatistics", "TiledWalks", "add_evidence", "marginalise", "survey_statistics"]
+__all__ = ["Evidence", "Gram", "SurveyStatistics", "add_evidence", "marginalise", "survey_statistics"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gram:
+    """`Phi^T R^-1 Phi`: of white noise by its cosine moments (2k - 1, 2k - 1), else by its entries (m, m)."""
+
+    table: Array
+    of_moments: bool
+
+    def scaled(self, basis: CosineBasis, scale: Array) -> Array:
+        """`diag(scale) Phi^T R^-1 Phi diag(scale)` (m, m): the lower triangle, in Fortran order."""
+        if self.of_moments:
+            return gram_of_moments(basis, self.table, scale)
+        return np.asfortranarray(self.table * np.outer(scale, scale))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyStatistics:
-    """gram (m, m), target (m, c), offset (m,), ones, ones_target (c,), energy (c,), log_det_shape, count: see above."""
+    """gram, target (m, c), offset (m,), ones, ones_target (c,), energy (c,), log_det_shape, count: see above."""
 
-    gram: Array
+    gram: Gram
     target: Array
     offset: Array
     ones: float
@@ -38,13 +50,31 @@ class SurveyStatistics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Statistics with the surveys' offsets integrated out, ready to be added: gram (m, m), target (m, c)."""
+    """Statistics with the surveys' offsets integrated out, ready to be added: target (m, c), and of the precision
 
-    gram: Array
+    `gram - offsets diag(signs) offsets^T`, offsets (m, s), signs (s,) of plus and minus one.
+    """
+
+    gram: Gram
+    offsets: Array
+    signs: Array
     target: Array
 
     def __sub__(self, other: "Evidence") -> "Evidence":
-        return Evidence(self.gram - other.gram, self.target - other.target)
+        return Evidence(
+            Gram(self.gram.table - other.gram.table, self.gram.of_moments),
+            np.hstack([self.offsets, other.offsets]),
+            np.concatenate([self.signs, -other.signs]),
+            self.target - other.target,
+        )
+
+    def scaled_precision(self, basis: CosineBasis, scale: Array) -> Array:
+        """`I + diag(scale) precision diag(scale)` (m, m): the lower triangle, in Fortran order."""
+        precision = self.gram.scaled(basis, scale)
+        offsets = scale[:, None] * self.offsets
+        precision = dgemm(-1.0, offsets * self.signs, offsets, 1.0, precision, trans_b=1, overwrite_c=1)
+        precision[np.diag_indices_from(precision)] += 1.0
+        return np.asarray(precision)
 
 
 def survey_statistics(
@@ -54,62 +84,64 @@ def survey_statistics(
 
     points_m (n, 2); deviation_uT (n, c) features minus the ambient field; path_m (n,) distance walked.
     """
+    if noise == WHITE:
+        return _white_statistics(basis, points_m, deviation_uT)
     m = basis.size
     columns = np.empty((len(points_m), m + 1 + deviation_uT.shape[1]), order="F")
     columns[:, :m], columns[:, m], columns[:, m + 1 :] = basis.at(points_m), 1.0, deviation_uT
     white, log_det = whiten(columns, path_m, noise)
-    upper = dsyrk(1.0, white, trans=1)
-    products = upper + np.triu(upper, 1).T
+    products = dsyrk(1.0, white, trans=1, lower=1)
     return SurveyStatistics(
-        gram=products[:m, :m],
-        target=products[:m, m + 1 :],
-        offset=products[:m, m],
+        gram=Gram(products[:m, :m], of_moments=False),
+        target=products[m + 1 :, :m].T,
+        offset=products[m, :m],
         ones=float(products[m, m]),
-        ones_target=products[m, m + 1 :],
+        ones_target=products[m + 1 :, m],
         energy=np.diagonal(products)[m + 1 :],
         log_det_shape=log_det,
         count=len(points_m),
     )
 
 
-class TiledWalks:
-    """Walks cut up by the tiles of a lattice."""
-
-    def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> None:
-        self.lattice = lattice
-        self._walks = {walk.survey_id: walk for walk in walks}
-        self._ambient_uT = ambient_uT
-        self._members: dict[Tile, dict[str, NDArray[np.int64]]] = {}
-        worth_fitting = set().union(*(lattice.reached(walk.position_m[:, :2]) for walk in walks))
-        for walk in walks:
-            for tile, inside in lattice.fitting(walk.position_m[:, :2]).items():
-                if tile in worth_fitting:
-                    self._members.setdefault(tile, {})[walk.survey_id] = inside
-
-    def counts(self) -> dict[Tile, int]:
-        """Tile -> observations it is fitted from, in order of tile."""
-        return {tile: sum(map(len, self._members[tile].values())) for tile in sorted(self._members)}
-
-    def statistics(self, tile: Tile, noise: WalkNoise) -> dict[str, SurveyStatistics]:
-        """Survey id -> statistics of the surveys that cross the tile, in the walks' order."""
-        basis = self.lattice.basis(tile)
-        result: dict[str, SurveyStatistics] = {}
-        for survey_id, inside in self._members[tile].items():
-            walk = self._walks[survey_id]
-            deviation_uT = walk.field_uT[inside] - self._ambient_uT
-            points_m, path_m = walk.position_m[inside, :2], walk.path_m[inside]
-            result[survey_id] = survey_statistics(basis, points_m, deviation_uT, path_m, noise)
-        return result
+def _white_statistics(basis: CosineBasis, points_m: Array, deviation_uT: Array) -> SurveyStatistics:
+    """Of white noise, from the cosine moments of the points and of the features at them."""
+    k, degrees = basis.functions_per_axis, 2 * basis.functions_per_axis - 1
+    components = deviation_uT.shape[1]
+    x, y = cosines(basis, 0, points_m[:, 0]), cosines(basis, 1, points_m[:, 1])
+    weighted = (deviation_uT[:, :, None] * y[:, None, :k]).reshape(len(points_m), components * k)
+    moments = x.T @ np.hstack([y, weighted])
+    along_x, along_y = basis.orders.T
+    targets = moments[:k, degrees:].reshape(k, components, k)
+    return SurveyStatistics(
+        gram=Gram(moments[:, :degrees], of_moments=True),
+        target=basis.norms[:, None] * targets[along_x, :, along_y],
+        offset=basis.norms * moments[along_x, along_y],
+        ones=float(len(points_m)),
+        ones_target=np.sum(deviation_uT, axis=0),
+        energy=np.sum(np.square(deviation_uT), axis=0),
+        log_det_shape=0.0,
+        count=len(points_m),
+    )
 
 
 def add_evidence(evidence: Collection[Evidence]) -> Evidence:
     """The evidence of a whole tile: the sum over its surveys."""
-    return Evidence(np.sum([e.gram for e in evidence], axis=0), np.sum([e.target for e in evidence], axis=0))
+    one, *_ = evidence
+    return Evidence(
+        Gram(np.sum([e.gram.table for e in evidence], axis=0), one.gram.of_moments),
+        np.hstack([e.offsets for e in evidence]),
+        np.concatenate([e.signs for e in evidence]),
+        np.sum([e.target for e in evidence], axis=0),
+    )
 
 
 def marginalise(survey: SurveyStatistics, white_ratio: float, bias_ratio: float) -> Evidence:
     """The survey's evidence about the weights in units of the signal variance, its offset integrated out."""
     shrink = bias_ratio / (white_ratio + bias_ratio * survey.ones)
-    gram = survey.gram - shrink * np.outer(survey.offset, survey.offset)
     target = survey.target - shrink * np.outer(survey.offset, survey.ones_target)
-    return Evidence(gram / white_ratio, target / white_ratio)
+    return Evidence(
+        Gram(survey.gram.table / white_ratio, survey.gram.of_moments),
+        np.sqrt(shrink / white_ratio) * survey.offset[:, None],
+        np.ones(1),
+        target / white_ratio,
+    )

@@ -18,13 +18,15 @@ from app.geometry import Array
 
 __all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "REACH_M", "Lattice", "Tile"]
 
-PITCHES_M = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 64.0, 100.0)
-PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
-"""A rough kernel has detail finer than its length and wants functions packed closer than a smooth one."""
+PITCHES_M = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0, 10.0, 12.5, 16.0, 20.0, 25.0, 32.0, 40.0, 63.0, 100.0)
+PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.4}
+WIDE_PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
+"""A rough kernel has detail finer than its length and wants functions packed closer than a smooth one. Small tiles
+cost least; only wide ones can tell a long length, or a survey's offset in the tile, from a large field."""
 MARGIN = 0.3
 OVERLAP = 0.1
-FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 14, "matern52": 18, "matern32": 20}
-
+FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 14, "matern32": 15}
+WIDE_FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 20, "matern32": 22}
 
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
@@ -47,10 +49,13 @@ class Lattice:
     functions_per_axis: int = FUNCTIONS_PER_AXIS["matern32"]
 
     @classmethod
-    def for_length(cls, kernel: Kernel, length_m: float) -> "Lattice":
+    def for_length(cls, kernel: Kernel, length_m: float, wide: bool = False) -> "Lattice":
         """The finest lattice whose tiles are wide enough for a kernel of this length."""
-        pitch = next((p for p in PITCHES_M if p >= PITCH_IN_LENGTHS[kernel] * length_m), PITCHES_M[-1])
-        return cls(pitch, functions_per_axis=FUNCTIONS_PER_AXIS[kernel])
+        pitch_in_lengths = WIDE_PITCH_IN_LENGTHS if wide else PITCH_IN_LENGTHS
+        functions = WIDE_FUNCTIONS_PER_AXIS if wide else FUNCTIONS_PER_AXIS
+        least_m = pitch_in_lengths[kernel] * length_m
+        pitch_m = next((pitch for pitch in PITCHES_M if pitch >= least_m), PITCHES_M[-1])
+        return cls(pitch_m, functions_per_axis=functions[kernel])
 
     def basis(self, tile: Tile) -> CosineBasis:
         """The functions a tile is fitted with, on its core and margin."""
@@ -93,18 +98,18 @@ class Lattice:
 
     def _members(self, points_m: Array, reach: float) -> dict[Tile, NDArray[np.int64]]:
         scaled = points_m / self.pitch_m
-        home = np.floor(scaled).astype(np.int64)
-        members: dict[Tile, list[NDArray[np.int64]]] = {}
+        tiles, indices = [], []
         for step in np.ndindex(3, 3):
-            tile = home + np.asarray(step) - 1
+            tile = np.floor(scaled).astype(np.int64) + np.asarray(step) - 1
             near = np.flatnonzero(np.all((scaled >= tile - reach) & (scaled <= tile + 1 + reach), axis=1))
-            order = near[np.lexsort((near, tile[near, 1], tile[near, 0]))]
-            changes = np.any(tile[order[1:]] != tile[order[:-1]], axis=1)
-            cuts = [0, *(np.flatnonzero(changes) + 1).tolist(), len(order)]
-            for start, stop in pairwise(cuts if len(order) else []):
-                column, row = tile[order[start]].tolist()
-                members.setdefault(Tile(column, row), []).append(order[start:stop])
-        return {tile: np.sort(np.concatenate(members[tile])) for tile in sorted(members)}
+            tiles.append(tile[near])
+            indices.append(near)
+        tile, index = np.concatenate(tiles), np.concatenate(indices)
+        order = np.lexsort((index, tile[:, 1], tile[:, 0]))
+        tile, index = tile[order], index[order]
+        starts = np.flatnonzero(np.any(tile[1:] != tile[:-1], axis=1)) + 1
+        cuts = [0, *starts.tolist(), len(order)] if len(order) else []
+        return {Tile(*tile[start].tolist()): index[start:stop] for start, stop in pairwise(cuts)}
 
 
 def _smooth_step(t: Array) -> Array:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.field.basis import CosineBasis, VarianceSeries
+from app.field.basis import CosineBasis
 
 
 @pytest.fixture
@@ -29,17 +29,3 @@ def test_slopes_are_derivatives(basis, axis):
     at, h = np.linspace(2.1, 4.4, 5), 1e-6
     numeric = (basis.along(axis, at + h) - basis.along(axis, at - h)) / (2 * h)
     assert np.allclose(basis.slope_along(axis, at), numeric, atol=1e-6)
-
-
-def test_variance_series_equals_the_quadratic_form(basis):
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(basis.size, basis.size))
-    covariance = root @ root.T
-    points = rng.uniform([-1.5, 2.0], [4.5, 8.0], (30, 2))
-    phi = basis.at(points)
-    naive = np.einsum("nm,mk,nk->n", phi, covariance, phi)
-    series = VarianceSeries.of(basis, covariance)
-    assert np.allclose(series.at(points), naive, rtol=1e-10)
-    x, y = points[:4, 0], points[4:9, 1]
-    lattice = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    assert np.allclose(series.on_lattice(x, y).ravel(), series.at(lattice), rtol=1e-10)

@@ -9,7 +9,8 @@ from app.field.hyperparameters import Hyperparameters
 from app.field.kernels import covariance
 from app.field.observations import observe
 from app.field.raster import BlendedField, GridFrame
-from app.field.statistics import TiledWalks, add_evidence, marginalise, survey_statistics
+from app.field.statistics import add_evidence, marginalise, survey_statistics
+from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice
 
 AMBIENT = np.array([18.0, 3.0, -44.0])

@@ -7,7 +7,8 @@ from app.field.hyperparameters import Hyperparameters
 from app.field.leave_one_out import HeldOut, HeldOutPrediction, error_correlation_m, score
 from app.field.observations import observe
 from app.field.spec import MapSpec
-from app.field.statistics import TiledWalks, add_evidence, marginalise
+from app.field.statistics import add_evidence, marginalise
+from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice
 
 AMBIENT = np.array([18.0, 3.0, -44.0])

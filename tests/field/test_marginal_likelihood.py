@@ -28,7 +28,7 @@ def walks(noise, components=2, seed=0):
 
 
 def tile(data, noise):
-    return TileStatistics(BASIS, {str(i): survey_statistics(BASIS, *walk, noise) for i, walk in enumerate(data)})
+    return TileStatistics.of(BASIS, [survey_statistics(BASIS, *walk, noise) for walk in data])
 
 
 def dense_covariance(data, noise, length, white, bias, kernel):
@@ -85,7 +85,7 @@ def test_learning_never_ends_below_where_it_started():
 
 def test_a_constant_field_is_learned_without_dividing_by_zero():
     points, _, path = walks(WHITE)[0]
-    flat = TileStatistics(BASIS, {"a": survey_statistics(BASIS, points, np.zeros((len(points), 1)), path, WHITE)})
+    flat = TileStatistics.of(BASIS, [survey_statistics(BASIS, points, np.zeros((len(points), 1)), path, WHITE)])
     hyper, _, value = learn([flat], "matern32", WHITE)
     assert np.isfinite(value)
     assert hyper.signal_sd_uT[0] < 0.1

@@ -1,0 +1,112 @@
+"""Products of cosines are sums of cosines: Gram matrices and variances of a cosine basis by way of small tables.
+
+`cos s cos t = (cos(s - t) + cos(s + t)) / 2`, so with the moments of the points, over u, v = pi (p - corner) / side,
+
+    M[p, q] = sum_i cos(p u_i) cos(q v_i),      p, q < 2 k - 1,
+
+every entry of `Phi^T Phi` is a sum of four of them:
+
+    G[i, j] = norm_i norm_j (M[|a - a'|, |b - b'|] + M[a + a', |b - b'|] + M[|a - a'|, b + b'] + M[a + a', b + b']) / 4,
+
+(a, b) and (a', b') being the orders of functions i and j: n (2 k)^2 operations for n points where the direct product
+takes n m^2. Backwards, the variance `phi(p)^T C phi(p)` of weights of covariance C is a cosine series of twice the
+degree, whose (2 k - 1, 2 k - 1) coefficients every entry of C adds to in four places: exact anywhere for the price
+of the mean.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from app.field.basis import CosineBasis
+from app.geometry import Array
+
+__all__ = ["VarianceSeries", "cosines", "gram_of_moments"]
+
+
+def cosines(basis: CosineBasis, axis: int, coordinate_m: Array) -> Array:
+    """(n, 2k - 1) `cos(p u)` of one axis (0: x, 1: y), twice the degree of the functions."""
+    unit = np.pi / basis.side_m * (coordinate_m - basis.corner_m[axis])
+    return np.asarray(_chebyshev(np.cos(unit), 2 * basis.functions_per_axis - 1))
+
+
+def gram_of_moments(basis: CosineBasis, moments: Array, scale: Array) -> Array:
+    """`diag(scale) Phi^T Phi diag(scale)` (m, m) of the points of these moments, scale (m,).
+
+    Only the lower triangle, in Fortran order for LAPACK; the other is zero.
+    """
+    return np.asarray(_gram(moments, basis.orders, scale * basis.norms).T)
+
+
+@dataclass(frozen=True, slots=True)
+class VarianceSeries:
+    """The variance `phi(p)^T C phi(p)` as a cosine series; `coefficients` (2k - 1, 2k - 1) over x and y."""
+
+    basis: CosineBasis
+    coefficients: Array
+
+    @classmethod
+    def of(cls, basis: CosineBasis, covariance: Array, scale: Array) -> "VarianceSeries":
+        """From `diag(scale) covariance diag(scale)` of the weights; only the lower triangle (m, m) is read."""
+        upper = np.ascontiguousarray(covariance.T)
+        return cls(basis, _series(upper, basis.orders, scale * basis.norms, 2 * basis.functions_per_axis - 1))
+
+    def at(self, points_m: Array) -> Array:
+        """(n,) variance at points (n, 2)."""
+        x, y = cosines(self.basis, 0, points_m[:, 0]), cosines(self.basis, 1, points_m[:, 1])
+        return np.asarray(np.maximum(np.sum((x @ self.coefficients) * y, axis=1), 0.0))
+
+    def on_lattice(self, x_m: Array, y_m: Array) -> Array:
+        """(ny, nx) variance at the crossings of columns and rows."""
+        series = cosines(self.basis, 1, y_m) @ self.coefficients.T @ cosines(self.basis, 0, x_m).T
+        return np.asarray(np.maximum(series, 0.0))
+
+
+@njit(cache=True)
+def _chebyshev(cosine: Array, degrees: int) -> Array:
+    """(n, degrees) `cos(p u)` from `cos u` (n,): `cos((p + 1) u) = 2 cos u cos(p u) - cos((p - 1) u)`."""
+    table = np.empty((len(cosine), degrees))
+    for i in range(len(cosine)):
+        table[i, 0] = 1.0
+        if degrees > 1:
+            table[i, 1] = cosine[i]
+        for p in range(2, degrees):
+            table[i, p] = 2.0 * cosine[i] * table[i, p - 1] - table[i, p - 2]
+    return table
+
+
+@njit(cache=True)
+def _gram(moments: Array, orders: NDArray[np.int64], scale: Array) -> Array:
+    """The upper triangle in C order."""
+    m = len(orders)
+    gram = np.zeros((m, m))
+    row = np.empty(moments.shape[1])
+    for i in range(m):
+        a, b = orders[i, 0], orders[i, 1]
+        last = -1
+        for j in range(i, m):
+            other_a, other_b = orders[j, 0], orders[j, 1]
+            if other_a != last:
+                last = other_a
+                for q in range(len(row)):
+                    row[q] = moments[other_a - a, q] + moments[a + other_a, q]
+            gram[i, j] = 0.25 * scale[i] * scale[j] * (row[abs(b - other_b)] + row[b + other_b])
+    return gram
+
+
+@njit(cache=True)
+def _series(covariance: Array, orders: NDArray[np.int64], scale: Array, degrees: int) -> Array:
+    """From the upper triangle in C order, the other taken to be its mirror."""
+    coefficients = np.zeros((degrees, degrees))
+    for i in range(len(orders)):
+        a, b = orders[i, 0], orders[i, 1]
+        for j in range(i, len(orders)):
+            other_a, other_b = orders[j, 0], orders[j, 1]
+            share = (0.25 if i == j else 0.5) * scale[i] * scale[j] * covariance[i, j]
+            coefficients[other_a - a, abs(b - other_b)] += share
+            coefficients[other_a - a, b + other_b] += share
+            coefficients[a + other_a, abs(b - other_b)] += share
+            coefficients[a + other_a, b + other_b] += share
+    return coefficients
