@@ -40,13 +40,12 @@ class CosineBasis:
     @property
     def frequencies_squared(self) -> Array:
         """(m,) eigenvalues of minus the Laplacian, (rad/m)^2."""
-        return np.asarray((np.pi / self.side_m) ** 2 * np.sum(np.square(self.orders), axis=1))
+        return _frequencies_squared(self.side_m, self.functions_per_axis)
 
     @property
     def norms(self) -> Array:
         """(m,) factor of the product of cosines in every function, 1/m."""
-        norms = self._axis_norms()
-        return np.asarray(norms[self.orders[:, 0]] * norms[self.orders[:, 1]])
+        return _norms(self.side_m, self.functions_per_axis)
 
     @property
     def cutoff_rad_per_m(self) -> float:
@@ -56,12 +55,12 @@ class CosineBasis:
 
     def along(self, axis: int, coordinate_m: Array) -> Array:
         """(n, functions_per_axis) values of the functions of one axis (0: x, 1: y)."""
-        return self._axis_norms() * np.cos(self._angles(axis, coordinate_m))
+        return _axis_norms(self.side_m, self.functions_per_axis) * np.cos(self._angles(axis, coordinate_m))
 
     def slope_along(self, axis: int, coordinate_m: Array) -> Array:
         """(n, functions_per_axis) exact derivatives of `along` with the coordinate, per metre."""
         k = np.pi / self.side_m * np.arange(self.functions_per_axis)
-        return -self._axis_norms() * k * np.sin(self._angles(axis, coordinate_m))
+        return -_axis_norms(self.side_m, self.functions_per_axis) * k * np.sin(self._angles(axis, coordinate_m))
 
     def at(self, points_m: Array) -> Array:
         """(n, m) values of all functions at points (n, 2)."""
@@ -79,11 +78,6 @@ class CosineBasis:
         unit = np.pi / self.side_m * (coordinate_m - self.corner_m[axis])
         return np.asarray(np.multiply.outer(unit, np.arange(self.functions_per_axis)))
 
-    def _axis_norms(self) -> Array:
-        norms = np.full(self.functions_per_axis, np.sqrt(2.0 / self.side_m))
-        norms[0] = np.sqrt(1.0 / self.side_m)
-        return norms
-
 
 @lru_cache(maxsize=8)
 def _orders(functions_per_axis: int) -> NDArray[np.int64]:
@@ -92,3 +86,25 @@ def _orders(functions_per_axis: int) -> NDArray[np.int64]:
     orders = np.column_stack([a[inside], b[inside]])
     orders.setflags(write=False)
     return orders
+
+
+@lru_cache(maxsize=8)
+def _axis_norms(side_m: float, functions_per_axis: int) -> Array:
+    norms = np.full(functions_per_axis, np.sqrt(2.0 / side_m))
+    norms[0] = np.sqrt(1.0 / side_m)
+    norms.setflags(write=False)
+    return norms
+
+
+@lru_cache(maxsize=8)
+def _norms(side_m: float, functions_per_axis: int) -> Array:
+    norms = np.prod(_axis_norms(side_m, functions_per_axis)[_orders(functions_per_axis)], axis=1)
+    norms.setflags(write=False)
+    return np.asarray(norms)
+
+
+@lru_cache(maxsize=8)
+def _frequencies_squared(side_m: float, functions_per_axis: int) -> Array:
+    squared = np.sum(np.square(np.pi / side_m * _orders(functions_per_axis)), axis=1)
+    squared.setflags(write=False)
+    return np.asarray(squared)

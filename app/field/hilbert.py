@@ -13,12 +13,25 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from app.field.basis import CosineBasis
 from app.field.hyperparameters import Hyperparameters
-from app.field.kernels import spectral_density
-from app.field.moments import VarianceSeries
+from app.field.moments import VarianceSeries, cosines, scaled_functions
 from app.field.statistics import Evidence
 from app.geometry import Array
 
-__all__ = ["LatticeField", "TilePosterior", "posterior", "predict"]
+__all__ = ["AxisFunctions", "LatticeField", "TilePosterior", "posterior", "predict"]
+
+
+class AxisFunctions(NamedTuple):
+    """One axis of a lattice of n points: values and slopes (n, k) of the functions, cosines (n, 2k - 1)."""
+
+    values: Array
+    slopes: Array
+    cosines: Array
+
+    @classmethod
+    def at(cls, basis: CosineBasis, axis: int, coordinate_m: Array) -> "AxisFunctions":
+        return cls(
+            basis.along(axis, coordinate_m), basis.slope_along(axis, coordinate_m), cosines(basis, axis, coordinate_m)
+        )
 
 
 class LatticeField(NamedTuple):
@@ -48,14 +61,12 @@ class TilePosterior:
             self.variance.at(points_m) + self.detail_ratio, 1.0
         )
 
-    def on_lattice(self, x_m: Array, y_m: Array) -> LatticeField:
-        """The field at the crossings of columns `x_m` and rows `y_m`, axis by axis."""
+    def on_lattice(self, x: AxisFunctions, y: AxisFunctions) -> LatticeField:
+        """The field at the crossings of columns and rows, axis by axis."""
         by_axis = self.basis.by_axis(self.weights_uT)
-        x, y = self.basis.along(0, x_m).T, self.basis.along(1, y_m)
-        dx, dy = self.basis.slope_along(0, x_m).T, self.basis.slope_along(1, y_m)
-        rows, row_slopes = y @ by_axis, dy @ by_axis
-        variance = np.minimum(self.variance.on_lattice(x_m, y_m) + self.detail_ratio, 1.0)
-        return LatticeField(rows @ x, rows @ dx, row_slopes @ x, variance)
+        rows, row_slopes = y.values @ by_axis, y.slopes @ by_axis
+        variance = np.minimum(self.variance.on_lattice(x.cosines, y.cosines) + self.detail_ratio, 1.0)
+        return LatticeField(rows @ x.values.T, rows @ x.slopes.T, row_slopes @ x.values.T, variance)
 
 
 def posterior(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> TilePosterior:
@@ -74,9 +85,12 @@ def predict(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters, poin
     root, factor = _factor(basis, evidence, hyper)
     components = evidence.target.shape[1]
     right = np.empty((basis.size, components + len(points_m)), order="F")
-    right[:, :components], right[:, components:] = root[:, None] * evidence.target, (basis.at(points_m) * root).T
+    right[:, :components], right[:, components:] = (
+        root[:, None] * evidence.target,
+        scaled_functions(basis, points_m, root),
+    )
     half = dtrsm(1.0, factor, right, lower=1, overwrite_b=1)
-    variance = np.sum(np.square(half[:, components:]), axis=0) + hyper.detail_ratio(basis)
+    variance = np.einsum("mn,mn->n", half[:, components:], half[:, components:]) + hyper.detail_ratio(basis)
     return half[:, components:].T @ half[:, :components], np.minimum(variance, 1.0)
 
 
@@ -85,7 +99,7 @@ def _factor(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> t
 
     Only its lower triangle is meant.
     """
-    root = np.sqrt(spectral_density(hyper.kernel, basis.frequencies_squared, hyper.length_m))
+    root = hyper.prior_sd(basis)
     factor, info = dpotrf(evidence.scaled_precision(basis, root), lower=1, clean=0, overwrite_a=1)
     assert info == 0, info
     return root, np.asarray(factor)

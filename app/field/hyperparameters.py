@@ -1,11 +1,12 @@
 """The numbers a map is fitted with: one kernel length and one noise shape for all components, one scale for each."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from app.field.basis import CosineBasis
-from app.field.kernels import variance_beyond
+from app.field.kernels import spectral_density, variance_beyond
 from app.field.spec import Kernel
 from app.field.walk_noise import WHITE, WalkNoise
 from app.geometry import Array
@@ -34,6 +35,10 @@ class Hyperparameters:
         """(c,) sd of one observation about the latent field: offset, correlated and white error together."""
         return np.asarray(self.signal_sd_uT * np.sqrt(self.bias_ratio + self.walk_ratio + self.white_ratio))
 
+    def prior_sd(self, basis: CosineBasis) -> Array:
+        """(m,) sd of the weight of every function, over the signal's sd."""
+        return _prior_sd(self.kernel, basis.side_m, basis.functions_per_axis, self.length_m)
+
     def detail_ratio(self, basis: CosineBasis) -> float:
         """Share of the signal's variance finer than the basis can follow. To the samples it is one more white error."""
         return variance_beyond(self.kernel, basis.cutoff_rad_per_m, self.length_m)
@@ -58,3 +63,12 @@ class Hyperparameters:
             "walk_noise_length_m": self.walk_length_m,
             "survey_bias_sd_ut": (self.signal_sd_uT * np.sqrt(self.bias_ratio)).tolist(),
         }
+
+
+@lru_cache(maxsize=8)
+def _prior_sd(kernel: Kernel, side_m: float, functions_per_axis: int, length_m: float) -> Array:
+    """The same for all tiles of a lattice, wherever their corner."""
+    basis = CosineBasis((0.0, 0.0), side_m, functions_per_axis)
+    sd = np.sqrt(spectral_density(kernel, basis.frequencies_squared, length_m))
+    sd.setflags(write=False)
+    return np.asarray(sd)

@@ -50,6 +50,11 @@ class _Learned:
     nats: float
     """Negative log marginal likelihood per observation and component."""
 
+    def start_with(self, noise: WalkNoise) -> Array:
+        """The logarithms (3,) to start from with another shape of noise: white and correlated error keep their sum."""
+        own = self.hyper.walk_ratio / self.hyper.white_ratio
+        return np.asarray(self.log_parameters + np.array([0.0, np.log1p(own) - np.log1p(noise.variance_ratio), 0.0]))
+
 
 class _Learner:
     """A few well-walked tiles of one lattice, to learn on."""
@@ -98,7 +103,7 @@ def _learning_lattice(kernel: Kernel, length_m: float) -> Lattice:
 
 def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:
     """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
-    first = [learner.learn(noise, white.log_parameters) for noise in TRIED_FIRST]
+    first = [learner.learn(noise, white.start_with(noise)) for noise in TRIED_FIRST]
     best = min(first, key=lambda learned: learned.nats)
     if best.nats > white.nats - WORTH_NATS:
         return white
@@ -107,7 +112,8 @@ def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) ->
     for trial in range(MAX_TRIALS):
         progress(0.5 + 0.5 * trial / MAX_TRIALS, "learning the errors along a walk")
         point = np.clip(centre + step * COMPASS[direction], *WALK_NOISE_BOUNDS_LOG)
-        found = learner.learn(WalkNoise(*np.exp(point).tolist()), best.log_parameters)
+        noise = WalkNoise(*np.exp(point).tolist())
+        found = learner.learn(noise, best.start_with(noise))
         if found.nats < best.nats:
             best, centre, failures = found, point, 0
             continue

@@ -6,13 +6,14 @@ and ambient field are the whole map's.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.field.hilbert import predict
 from app.field.hyperparameters import Hyperparameters
-from app.field.observations import Walk
+from app.field.observations import Walk, walk_bounds
 from app.field.spec import Score
 from app.field.statistics import Evidence
 from app.field.tiles import Lattice, Tile
@@ -55,23 +56,38 @@ class HeldOutPrediction:
 
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], hyper: Hyperparameters) -> None:
         self._lattice, self._hyper = lattice, hyper
-        self._walks = {walk.survey_id: walk for walk in walks}
-        self._answering = {walk.survey_id: lattice.answering(walk.position_m[:, :2]) for walk in walks}
-        self.mean_uT = {walk.survey_id: np.zeros(walk.field_uT.shape) for walk in walks}
-        self.variance_ratio = {walk.survey_id: np.ones(len(walk)) for walk in walks}
+        self._points_m = np.concatenate([walk.position_m[:, :2] for walk in walks])
+        self._answering = lattice.answering(self._points_m)
+        self._bounds = dict(zip((walk.survey_id for walk in walks), pairwise(walk_bounds(walks)), strict=True))
+        self._mean_uT = np.zeros((len(self._points_m), walks[0].field_uT.shape[1]))
+        self._variance_ratio = np.ones(len(self._points_m))
+
+    @property
+    def mean_uT(self) -> dict[str, Array]:
+        """Survey id -> (n, c) about the ambient field."""
+        return {survey_id: self._mean_uT[start:stop] for survey_id, (start, stop) in self._bounds.items()}
+
+    @property
+    def variance_ratio(self) -> dict[str, Array]:
+        """Survey id -> (n,) variance of the latent field over the signal's."""
+        return {survey_id: self._variance_ratio[start:stop] for survey_id, (start, stop) in self._bounds.items()}
 
     def add(self, tile: Tile, evidence: Mapping[str, Evidence], total: Evidence) -> None:
         """Predict the walks that cross this tile, each from the evidence of the others."""
+        answered = self._answering.get(tile)
+        if answered is None or len(evidence) == 1:
+            return
         basis = self._lattice.basis(tile)
+        x_m, y_m = self._points_m[answered].T
+        weight = self._lattice.weight(0, tile, x_m) * self._lattice.weight(1, tile, y_m)
         for survey_id, own in evidence.items():
-            inside = self._answering[survey_id].get(tile)
-            if inside is None or len(evidence) == 1:
+            start, stop = np.searchsorted(answered, self._bounds[survey_id])
+            if start == stop:
                 continue
-            points_m = self._walks[survey_id].position_m[inside, :2]
-            mean_uT, variance_ratio = predict(basis, total - own, self._hyper, points_m)
-            weight = self._lattice.weight(0, tile, points_m[:, 0]) * self._lattice.weight(1, tile, points_m[:, 1])
-            self.mean_uT[survey_id][inside] += weight[:, None] * mean_uT
-            self.variance_ratio[survey_id][inside] += weight * (variance_ratio - 1.0)
+            inside = answered[start:stop]
+            mean_uT, variance_ratio = predict(basis, total - own, self._hyper, self._points_m[inside])
+            self._mean_uT[inside] += weight[start:stop, None] * mean_uT
+            self._variance_ratio[inside] += weight[start:stop] * (variance_ratio - 1.0)
 
 
 def score(held_out: Mapping[str, HeldOut]) -> Score | None:

@@ -150,7 +150,7 @@ def _tile_terms(tile: TileStatistics, kernel: Kernel, length_m: float, white: fl
 
     precision = tile.gram.scaled(tile.basis, root / np.sqrt(white))
     precision = dgemm(-1.0 / white, offsets * shrink, offsets, 1.0, precision, trans_b=1, overwrite_c=1)
-    precision[np.diag_indices_from(precision)] += 1.0
+    np.einsum("ii->i", precision)[:] += 1.0
     factor, info = dpotrf(precision, lower=1, clean=1, overwrite_a=1)
     assert info == 0, info
     inverse, _ = dtrtri(factor, lower=1)

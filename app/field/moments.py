@@ -23,13 +23,29 @@ from numpy.typing import NDArray
 from app.field.basis import CosineBasis
 from app.geometry import Array
 
-__all__ = ["VarianceSeries", "cosines", "gram_of_moments"]
+__all__ = ["VarianceSeries", "cosines", "gram_of_moments", "moments_of", "scaled_functions"]
 
 
 def cosines(basis: CosineBasis, axis: int, coordinate_m: Array) -> Array:
     """(n, 2k - 1) `cos(p u)` of one axis (0: x, 1: y), twice the degree of the functions."""
-    unit = np.pi / basis.side_m * (coordinate_m - basis.corner_m[axis])
-    return np.asarray(_chebyshev(np.cos(unit), 2 * basis.functions_per_axis - 1))
+    return np.asarray(_chebyshev(_cosine(basis, axis, coordinate_m), 2 * basis.functions_per_axis - 1))
+
+
+def scaled_functions(basis: CosineBasis, points_m: Array, scale: Array) -> Array:
+    """`diag(scale) Phi^T` (m, n) at points (n, 2), scale (m,), in Fortran order."""
+    x, y = _cosine(basis, 0, points_m[:, 0]), _cosine(basis, 1, points_m[:, 1])
+    return np.asarray(_functions(x, y, basis.orders, scale * basis.norms, basis.functions_per_axis).T)
+
+
+def moments_of(basis: CosineBasis, points_m: Array, features: Array) -> tuple[Array, Array]:
+    """The moments (2k - 1, 2k - 1) of points (n, 2), and `Phi^T features` (m, c) for features (n, c)."""
+    x, y = _cosine(basis, 0, points_m[:, 0]), _cosine(basis, 1, points_m[:, 1])
+    moments, weighted = _moments(x, y, features, basis.functions_per_axis)
+    return moments, basis.norms[:, None] * weighted[basis.orders[:, 0], basis.orders[:, 1]]
+
+
+def _cosine(basis: CosineBasis, axis: int, coordinate_m: Array) -> Array:
+    return np.asarray(np.cos(np.pi / basis.side_m * (coordinate_m - basis.corner_m[axis])))
 
 
 def gram_of_moments(basis: CosineBasis, moments: Array, scale: Array) -> Array:
@@ -58,10 +74,9 @@ class VarianceSeries:
         x, y = cosines(self.basis, 0, points_m[:, 0]), cosines(self.basis, 1, points_m[:, 1])
         return np.asarray(np.maximum(np.sum((x @ self.coefficients) * y, axis=1), 0.0))
 
-    def on_lattice(self, x_m: Array, y_m: Array) -> Array:
-        """(ny, nx) variance at the crossings of columns and rows."""
-        series = cosines(self.basis, 1, y_m) @ self.coefficients.T @ cosines(self.basis, 0, x_m).T
-        return np.asarray(np.maximum(series, 0.0))
+    def on_lattice(self, cosines_x: Array, cosines_y: Array) -> Array:
+        """(ny, nx) variance at the crossings of columns and rows with these `cosines` (nx, 2k - 1), (ny, 2k - 1)."""
+        return np.asarray(np.maximum(cosines_y @ self.coefficients.T @ cosines_x.T, 0.0))
 
 
 @njit(cache=True)
@@ -75,6 +90,37 @@ def _chebyshev(cosine: Array, degrees: int) -> Array:
         for p in range(2, degrees):
             table[i, p] = 2.0 * cosine[i] * table[i, p - 1] - table[i, p - 2]
     return table
+
+
+@njit(cache=True)
+def _functions(x: Array, y: Array, orders: NDArray[np.int64], scale: Array, degrees: int) -> Array:
+    """(n, m) scaled products of the cosines of u and v, from `cos u` and `cos v` (n,)."""
+    along_x, along_y = _chebyshev(x, degrees), _chebyshev(y, degrees)
+    values = np.empty((len(x), len(orders)))
+    for i in range(len(x)):
+        for j in range(len(orders)):
+            values[i, j] = scale[j] * along_x[i, orders[j, 0]] * along_y[i, orders[j, 1]]
+    return values
+
+
+@njit(cache=True)
+def _moments(x: Array, y: Array, features: Array, k: int) -> tuple[Array, Array]:
+    """M (2k - 1, 2k - 1), and the same sums with every feature as weight (k, k, c); `cos u` and `cos v` (n,)."""
+    degrees, components = 2 * k - 1, features.shape[1]
+    along_x, along_y = _chebyshev(x, degrees), _chebyshev(y, degrees)
+    moments = np.zeros((degrees, degrees))
+    weighted = np.zeros((components, k, k))
+    for i in range(len(x)):
+        row = along_y[i]
+        for p in range(degrees):
+            for q in range(degrees):
+                moments[p, q] += along_x[i, p] * row[q]
+        for c in range(components):
+            for p in range(k):
+                factor = features[i, c] * along_x[i, p]
+                for q in range(k):
+                    weighted[c, p, q] += factor * row[q]
+    return moments, weighted.transpose(1, 2, 0)
 
 
 @njit(cache=True)

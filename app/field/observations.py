@@ -4,8 +4,9 @@ Averaging loses nothing (a field hardly bends over 20 cm) and makes a phone that
 observation instead of three thousand: errors at one place are one error, not many.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from app.errors import InvalidInput
 from app.field.samples import Components, Samples
 from app.geometry import Array
 
-__all__ = ["STRETCH_M", "Walk", "observe"]
+__all__ = ["STRETCH_M", "Walk", "observe", "walk_bounds"]
 
 STRETCH_M = 0.2
 MIN_OBSERVATIONS = 8
@@ -57,6 +58,11 @@ def observe(walks: Mapping[str, Samples], components: Components, stretch_m: flo
             f"{MIN_OBSERVATIONS}: upload longer walks"
         )
     return observed
+
+
+def walk_bounds(walks: Sequence[Walk]) -> list[int]:
+    """Where each walk begins, and the last one ends, when their observations are laid one after the other."""
+    return [0, *accumulate(map(len, walks))]
 
 
 def _average(survey_id: str, samples: Samples, components: Components, stretch_m: float) -> Walk:

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from app.errors import InvalidInput
-from app.field.hilbert import TilePosterior
+from app.field.hilbert import AxisFunctions, TilePosterior
 from app.field.observations import Walk
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
@@ -60,24 +61,49 @@ class BlendedField:
 
     def __init__(self, lattice: Lattice, frame: GridFrame, components: int) -> None:
         self._lattice, self._frame = lattice, frame
+        self._strips: dict[tuple[int, int], _Strip] = {}
         self.mean_uT = np.zeros((components, *frame.shape))
         self.gradient_uT_per_m = np.zeros((2, components, *frame.shape))
         self.variance_ratio = np.ones(frame.shape)
 
     def add(self, tile: Tile, fitted: TilePosterior) -> None:
         """Blend one tile in."""
-        columns, rows = self._cells(0, tile, self._frame.x_m), self._cells(1, tile, self._frame.y_m)
-        x_m, y_m = self._frame.x_m[columns], self._frame.y_m[rows]
-        if not (len(x_m) and len(y_m)):
+        x, y = self._strip(0, tile), self._strip(1, tile)
+        if not (len(x.weight) and len(y.weight)):
             return
-        wx, wy = self._lattice.weight(0, tile, x_m), self._lattice.weight(1, tile, y_m)[:, None]
-        dwx, dwy = self._lattice.weight_slope(0, tile, x_m), self._lattice.weight_slope(1, tile, y_m)[:, None]
-        values = fitted.on_lattice(x_m, y_m)
-        self.mean_uT[:, rows, columns] += wx * wy * values.mean_uT
-        self.gradient_uT_per_m[0, :, rows, columns] += wy * (wx * values.slope_x_uT_per_m + dwx * values.mean_uT)
-        self.gradient_uT_per_m[1, :, rows, columns] += wx * (wy * values.slope_y_uT_per_m + dwy * values.mean_uT)
-        self.variance_ratio[rows, columns] += wx * wy * (values.variance_ratio - 1.0)
+        cells = (slice(None), y.cells, x.cells)
+        wx, wy, dwx, dwy = x.weight, y.weight[:, None], x.weight_slope, y.weight_slope[:, None]
+        values = fitted.on_lattice(x.functions, y.functions)
+        self.mean_uT[cells] += wx * wy * values.mean_uT
+        self.gradient_uT_per_m[0][cells] += wy * (wx * values.slope_x_uT_per_m + dwx * values.mean_uT)
+        self.gradient_uT_per_m[1][cells] += wx * (wy * values.slope_y_uT_per_m + dwy * values.mean_uT)
+        self.variance_ratio[cells[1:]] += wx * wy * (values.variance_ratio - 1.0)
 
-    def _cells(self, axis: int, tile: Tile, centres_m: Array) -> slice:
-        start, stop = self._lattice.answers_between(axis, tile)
-        return slice(int(np.searchsorted(centres_m, start)), int(np.searchsorted(centres_m, stop, side="right")))
+    def _strip(self, axis: int, tile: Tile) -> "_Strip":
+        """What the tiles of one column (axis 0) or row share."""
+        key = (axis, tile[axis])
+        if key not in self._strips:
+            centres_m = self._frame.x_m if axis == 0 else self._frame.y_m
+            self._strips[key] = _Strip.of(self._lattice, axis, tile, centres_m)
+        return self._strips[key]
+
+
+class _Strip(NamedTuple):
+    """The columns (or rows) of cells that a column (or row) of tiles answers, with weights and functions there."""
+
+    cells: slice
+    weight: Array
+    weight_slope: Array
+    functions: AxisFunctions
+
+    @classmethod
+    def of(cls, lattice: Lattice, axis: int, tile: Tile, centres_m: Array) -> "_Strip":
+        start, stop = lattice.answers_between(axis, tile)
+        cells = slice(int(np.searchsorted(centres_m, start)), int(np.searchsorted(centres_m, stop, side="right")))
+        inside_m = centres_m[cells]
+        return cls(
+            cells,
+            lattice.weight(axis, tile, inside_m),
+            lattice.weight_slope(axis, tile, inside_m),
+            AxisFunctions.at(lattice.basis(tile), axis, inside_m),
+        )

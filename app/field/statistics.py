@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg.blas import dgemm, dsyrk
 
 from app.field.basis import CosineBasis
-from app.field.moments import cosines, gram_of_moments
+from app.field.moments import gram_of_moments, moments_of
 from app.field.walk_noise import WHITE, WalkNoise, whiten
 from app.geometry import Array
 
@@ -73,7 +73,7 @@ class Evidence:
         precision = self.gram.scaled(basis, scale)
         offsets = scale[:, None] * self.offsets
         precision = dgemm(-1.0, offsets * self.signs, offsets, 1.0, precision, trans_b=1, overwrite_c=1)
-        precision[np.diag_indices_from(precision)] += 1.0
+        np.einsum("ii->i", precision)[:] += 1.0
         return np.asarray(precision)
 
 
@@ -105,20 +105,14 @@ def survey_statistics(
 
 def _white_statistics(basis: CosineBasis, points_m: Array, deviation_uT: Array) -> SurveyStatistics:
     """Of white noise, from the cosine moments of the points and of the features at them."""
-    k, degrees = basis.functions_per_axis, 2 * basis.functions_per_axis - 1
-    components = deviation_uT.shape[1]
-    x, y = cosines(basis, 0, points_m[:, 0]), cosines(basis, 1, points_m[:, 1])
-    weighted = (deviation_uT[:, :, None] * y[:, None, :k]).reshape(len(points_m), components * k)
-    moments = x.T @ np.hstack([y, weighted])
-    along_x, along_y = basis.orders.T
-    targets = moments[:k, degrees:].reshape(k, components, k)
+    moments, target = moments_of(basis, points_m, deviation_uT)
     return SurveyStatistics(
-        gram=Gram(moments[:, :degrees], of_moments=True),
-        target=basis.norms[:, None] * targets[along_x, :, along_y],
-        offset=basis.norms * moments[along_x, along_y],
+        gram=Gram(moments, of_moments=True),
+        target=target,
+        offset=basis.norms * moments[basis.orders[:, 0], basis.orders[:, 1]],
         ones=float(len(points_m)),
-        ones_target=np.sum(deviation_uT, axis=0),
-        energy=np.sum(np.square(deviation_uT), axis=0),
+        ones_target=deviation_uT.sum(axis=0),
+        energy=np.einsum("nc,nc->c", deviation_uT, deviation_uT),
         log_det_shape=0.0,
         count=len(points_m),
     )

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from app.field.observations import Walk
+from app.field.observations import Walk, walk_bounds
 from app.field.statistics import SurveyStatistics, survey_statistics
 from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WalkNoise
@@ -21,7 +21,7 @@ class TiledWalks:
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> None:
         self.lattice = lattice
         self._survey_ids = [walk.survey_id for walk in walks]
-        self._bounds = np.cumsum([0, *map(len, walks)])
+        self._bounds = walk_bounds(walks)
         self._points_m = np.concatenate([walk.position_m[:, :2] for walk in walks])
         self._path_m = np.concatenate([walk.path_m for walk in walks])
         self._deviation_uT = np.concatenate([walk.field_uT for walk in walks]) - ambient_uT

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.field.basis import CosineBasis
-from app.field.moments import VarianceSeries, cosines, gram_of_moments
+from app.field.moments import VarianceSeries, cosines, gram_of_moments, moments_of, scaled_functions
 from app.field.statistics import survey_statistics
 from app.field.walk_noise import WHITE, WalkNoise
 
@@ -32,6 +32,15 @@ def test_the_gram_matrix_of_the_moments_is_the_direct_one(basis):
     assert np.allclose(gram_of_moments(basis, moments, scale), np.tril(scaled.T @ scaled), atol=1e-12)
 
 
+def test_moments_and_functions_are_the_direct_products(basis):
+    points, features = points_in(basis, 50), np.random.default_rng(3).normal(size=(50, 2))
+    moments, weighted = moments_of(basis, points, features)
+    assert np.allclose(moments, cosines(basis, 0, points[:, 0]).T @ cosines(basis, 1, points[:, 1]), atol=1e-11)
+    assert np.allclose(weighted, basis.at(points).T @ features, atol=1e-11)
+    scale = np.random.default_rng(1).uniform(0.1, 2.0, basis.size)
+    assert np.allclose(scaled_functions(basis, points, scale), (basis.at(points) * scale).T, atol=1e-12)
+
+
 def test_variance_series_equals_the_quadratic_form(basis):
     rng = np.random.default_rng(0)
     root = rng.normal(size=(basis.size, basis.size))
@@ -44,7 +53,9 @@ def test_variance_series_equals_the_quadratic_form(basis):
     assert np.allclose(series.at(points), naive, rtol=1e-10)
     x, y = points[:4, 0], points[4:9, 1]
     lattice = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    assert np.allclose(series.on_lattice(x, y).ravel(), series.at(lattice), rtol=1e-10)
+    assert np.allclose(
+        series.on_lattice(cosines(basis, 0, x), cosines(basis, 1, y)).ravel(), series.at(lattice), rtol=1e-10
+    )
 
 
 def test_statistics_by_moments_equal_those_of_vanishing_walk_noise(basis):
