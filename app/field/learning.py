@@ -11,7 +11,7 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 
 from app.field.hyperparameters import Hyperparameters
-from app.field.marginal_likelihood import START_LOG, TileStatistics, learn
+from app.field.marginal_likelihood import START_LOG, TOLERANCE, TileStatistics, learn
 from app.field.observations import Walk
 from app.field.spec import Kernel, Progress
 from app.field.tiled_walks import TiledWalks
@@ -32,6 +32,8 @@ GOOD_ENOUGH = 1.5
 """A lattice whose pitch is within this factor of the suited one learns the same length."""
 
 TRIED_FIRST = (WalkNoise(variance_ratio=0.3, length_m=1.5), WalkNoise(variance_ratio=10.0, length_m=5.0))
+ROUGH_TOLERANCE = 1e-3
+"""What is still less likely than white noise when an iteration gains less than this is not followed further."""
 WORTH_NATS = 0.02
 """Errors are taken to be correlated along a walk when that gains this log likelihood per observation and component."""
 MAX_TRIALS = 20
@@ -66,13 +68,13 @@ class _Learner:
         self._tiled = TiledWalks(lattice, walks, ambient_uT)
         self._chosen = _well_walked(self._tiled.counts())
 
-    def learn(self, noise: WalkNoise, start_log: Array) -> _Learned:
+    def learn(self, noise: WalkNoise, start_log: Array, tolerance: float = TOLERANCE) -> _Learned:
         tiles = [
             TileStatistics.of(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise).values())
             for tile in self._chosen
         ]
         hyper, log_parameters, value = learn(
-            tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias
+            tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias, tolerance
         )
         count = sum(tile.count for tile in tiles)
         return _Learned(hyper, log_parameters, value / (count * len(hyper.signal_sd_uT)))
@@ -103,11 +105,14 @@ def _learning_lattice(kernel: Kernel, length_m: float) -> Lattice:
 
 def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:
     """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
-    first = [learner.learn(noise, white.start_with(noise)) for noise in TRIED_FIRST]
-    best = min(first, key=lambda learned: learned.nats)
+    rough = [learner.learn(noise, white.start_with(noise), ROUGH_TOLERANCE) for noise in TRIED_FIRST]
+    tried, noise = min(zip(rough, TRIED_FIRST, strict=True), key=lambda pair: pair[0].nats)
+    if tried.nats > white.nats:
+        return white
+    best = learner.learn(noise, tried.log_parameters)
     if best.nats > white.nats - WORTH_NATS:
         return white
-    centre, step = np.log(astuple(TRIED_FIRST[first.index(best)])), np.log([4.0, 2.0])
+    centre, step = np.log(astuple(noise)), np.log([4.0, 2.0])
     direction, failures = 0, 0
     for trial in range(MAX_TRIALS):
         progress(0.5 + 0.5 * trial / MAX_TRIALS, "learning the errors along a walk")

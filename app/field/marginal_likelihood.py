@@ -28,7 +28,9 @@ SCALE_FLOOR_UT2 = 1e-6
 LENGTH_BOUNDS_M = (0.3, 40.0)
 RATIO_BOUNDS_LOG = np.log([(1e-6, 1e2), (1e-8, 1e1)])
 MAX_ITERATIONS = 40
-START_LOG = np.log([3.0, 1e-2, 1e-3])
+TOLERANCE = 1e-5
+"""Relative gain of an iteration below which the search ends; the objective is the value per observation, about one."""
+START_LOG = np.log([3.0, 1e-2, 1e-4])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,19 +109,21 @@ def learn(
     start_log: Array = START_LOG,
     length_bounds_m: tuple[float, float] = LENGTH_BOUNDS_M,
     pin_bias: bool = False,
+    tolerance: float = TOLERANCE,
 ) -> tuple[Hyperparameters, Array, float]:
     """The most likely hyper-parameters, their logarithms (to start from next time), and the value reached.
 
-    `pin_bias` keeps the offset at its lower bound: a single survey's offset is the ambient field's.
+    The search ends when an iteration gains less than `tolerance` of the value. `pin_bias` keeps the offset at its lower bound: a single survey's offset is the ambient field's.
     """
     bounds = np.vstack([np.log(length_bounds_m), RATIO_BOUNDS_LOG])
     if pin_bias:
         bounds[2, 1] = bounds[2, 0]
 
     def objective(log_parameters: Array) -> tuple[float, Array]:
-        likelihood = negative_log_likelihood(tiles, kernel, log_parameters)
+        likelihood = seen[log_parameters.tobytes()] = negative_log_likelihood(tiles, kernel, log_parameters)
         return likelihood.value / count, likelihood.gradient / count
 
+    seen: dict[bytes, Likelihood] = {}
     count = sum(tile.count for tile in tiles)
     start = np.clip(start_log, bounds[:, 0], bounds[:, 1])
     best = minimize(
@@ -128,9 +132,9 @@ def learn(
         jac=True,
         method="L-BFGS-B",
         bounds=list(map(tuple, bounds.tolist())),
-        options={"maxiter": MAX_ITERATIONS, "ftol": 1e-6},
+        options={"maxiter": MAX_ITERATIONS, "ftol": tolerance},
     )
-    likelihood = negative_log_likelihood(tiles, kernel, best.x)
+    likelihood = seen[best.x.tobytes()]
     length_m, white_ratio, bias_ratio = (float(v) for v in np.exp(best.x))
     scale = np.sqrt(likelihood.signal_variance_uT2)
     hyper = Hyperparameters(kernel, length_m, scale, white_ratio, bias_ratio)
