@@ -113,7 +113,8 @@ def learn(
 ) -> tuple[Hyperparameters, Array, float]:
     """The most likely hyper-parameters, their logarithms (to start from next time), and the value reached.
 
-    The search ends when an iteration gains less than `tolerance` of the value. `pin_bias` keeps the offset at its lower bound: a single survey's offset is the ambient field's.
+    The search ends when an iteration gains less than `tolerance` of the value. `pin_bias` keeps the offset at its
+    lower bound: a single survey's offset is the ambient field's.
     """
     bounds = np.vstack([np.log(length_bounds_m), RATIO_BOUNDS_LOG])
     if pin_bias:

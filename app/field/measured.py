@@ -34,13 +34,16 @@ def measured_cells(
 def near_other_walks(walks: Sequence[Walk]) -> dict[str, NDArray[np.bool_]]:
     """Survey id -> (N,) samples within REACH_M of an observation of another survey."""
     trees = {walk.survey_id: cKDTree(walk.position_m[:, :2]) for walk in walks}
+    boxes = {name: (tree.mins - REACH_M, tree.maxes + REACH_M) for name, tree in trees.items()}
     near: dict[str, NDArray[np.bool_]] = {}
     for walk in walks:
         points = walk.position_m[:, :2]
         close = np.zeros(len(points), dtype=np.bool_)
         for other in walks:
-            if other is not walk and not close.all():
-                distance_m, _ = trees[other.survey_id].query(points[~close], distance_upper_bound=REACH_M)
-                close[~close] = np.isfinite(distance_m)
+            low, high = boxes[other.survey_id]
+            asked = np.flatnonzero(~close & np.all((points >= low) & (points <= high), axis=1))
+            if other is not walk and len(asked):
+                distance_m, _ = trees[other.survey_id].query(points[asked], distance_upper_bound=REACH_M)
+                close[asked] = np.isfinite(distance_m)
         near[walk.survey_id] = close[walk.stretch_of_sample]
     return near

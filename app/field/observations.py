@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from app.errors import InvalidInput
@@ -81,13 +82,16 @@ def _average(survey_id: str, samples: Samples, components: Components, stretch_m
     return Walk(survey_id, position_m, mean, path_m, scatter, field_uT, stretch_of_sample)
 
 
+@njit(cache=True)
 def _stretch_starts(position_m: Array, stretch_m: float) -> NDArray[np.int64]:
     """A new stretch begins where the walk is `stretch_m` away from where the present one began."""
-    limit = stretch_m**2
-    starts = [0]
-    x0, y0, z0 = position_m[0].tolist()
-    for index, (x, y, z) in enumerate(position_m.tolist()):
-        if (x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2 >= limit:
-            starts.append(index)
-            x0, y0, z0 = x, y, z
-    return np.asarray(starts, dtype=np.int64)
+    starts = np.zeros(len(position_m), dtype=np.int64)
+    count, first = 1, 0
+    for index in range(len(position_m)):
+        squared = 0.0
+        for axis in range(3):
+            squared += (position_m[index, axis] - position_m[first, axis]) ** 2
+        if squared >= stretch_m**2:
+            starts[count], first = index, index
+            count += 1
+    return starts[:count]

@@ -19,7 +19,7 @@ from app.geometry import Array
 __all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "REACH_M", "Lattice", "Tile"]
 
 PITCHES_M = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0, 10.0, 12.5, 16.0, 20.0, 25.0, 32.0, 40.0, 63.0, 100.0)
-PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.4}
+PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.5}
 WIDE_PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
 """A rough kernel has detail finer than its length and wants functions packed closer than a smooth one. Small tiles
 cost least; only wide ones can tell a long length, or a survey's offset in the tile, from a large field."""
