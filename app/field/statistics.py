@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg.blas import dgemm, dsyrk
 
 from app.field.basis import CosineBasis
-from app.field.moments import gram_of_moments, moments_of
+from app.field.moments import gram_of_moments, moments_of, scaled_functions
 from app.field.walk_noise import WHITE, WalkNoise, whiten
 from app.geometry import Array
 
@@ -87,10 +87,14 @@ def survey_statistics(
     if noise == WHITE:
         return _white_statistics(basis, points_m, deviation_uT)
     m = basis.size
-    columns = np.empty((len(points_m), m + 1 + deviation_uT.shape[1]), order="F")
-    columns[:, :m], columns[:, m], columns[:, m + 1 :] = basis.at(points_m), 1.0, deviation_uT
+    columns = np.empty((len(points_m), m + 1 + deviation_uT.shape[1]))
+    columns[:, :m], columns[:, m], columns[:, m + 1 :] = (
+        scaled_functions(basis, points_m, np.ones(m)).T,
+        1.0,
+        deviation_uT,
+    )
     white, log_det = whiten(columns, path_m, noise)
-    products = dsyrk(1.0, white, trans=1, lower=1)
+    products = dsyrk(1.0, white.T, lower=1)
     return SurveyStatistics(
         gram=Gram(products[:m, :m], of_moments=False),
         target=products[m + 1 :, :m].T,

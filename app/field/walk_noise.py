@@ -1,15 +1,14 @@
 """Errors along a walk: white noise plus an Ornstein-Uhlenbeck process over the distance walked, whitened in O(n).
 
 In units of the white variance the covariance of one walk's errors is `R = I + ratio * exp(-|s - s'| / length)`.
-Differencing with `rho = exp(-step / length)` makes R tridiagonal, and a banded Cholesky factor whitens it: the
+Differencing with `rho = exp(-step / length)` makes R tridiagonal, and its Cholesky factor, of one band, whitens it: the
 innovations of the Kalman filter of the same model, for any spacing and for walks that leave a tile and come back.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dtbtrs
+from numba import njit
 
 from app.geometry import Array
 
@@ -32,13 +31,21 @@ def whiten(columns: Array, path_m: Array, noise: WalkNoise) -> tuple[Array, floa
     if noise.variance_ratio == 0.0:
         return columns, 0.0
     rho = np.exp(-np.diff(path_m) / noise.length_m)
-    differenced = np.array(columns, order="F")
-    differenced[1:] -= rho[:, None] * columns[:-1]
-    band = np.zeros((2, len(path_m)))
-    band[0, 0] = noise.variance_ratio + 1.0
-    band[0, 1:] = noise.variance_ratio * (1.0 - rho**2) + 1.0 + rho**2
-    band[1, :-1] = -rho
-    factor = cholesky_banded(band, lower=True, check_finite=False)
-    white, info = dtbtrs(factor, differenced, uplo="L", overwrite_b=1)
-    assert info == 0, info
-    return np.asarray(white), float(2.0 * np.sum(np.log(factor[0])))
+    return _whiten(np.ascontiguousarray(columns), rho, noise.variance_ratio)
+
+
+@njit(cache=True)
+def _whiten(columns: Array, rho: Array, variance_ratio: float) -> tuple[Array, float]:
+    """Differences, and forward substitution with the Cholesky factor of their tridiagonal covariance, row by row."""
+    white = np.empty_like(columns)
+    scale = np.sqrt(variance_ratio + 1.0)
+    white[0] = columns[0] / scale
+    log_det = 2.0 * np.log(scale)
+    for i in range(1, len(columns)):
+        r = rho[i - 1]
+        below = -r / scale
+        scale = np.sqrt(variance_ratio * (1.0 - r * r) + 1.0 + r * r - below * below)
+        for j in range(columns.shape[1]):
+            white[i, j] = (columns[i, j] - r * columns[i - 1, j] - below * white[i - 1, j]) / scale
+        log_det += 2.0 * np.log(scale)
+    return white, log_det
