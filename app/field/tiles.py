@@ -6,7 +6,7 @@ across the overlap and sum to 1 everywhere.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -98,11 +98,13 @@ class Lattice:
 
     def _members(self, points_m: Array, reach: float) -> dict[Tile, NDArray[np.int64]]:
         scaled = points_m / self.pitch_m
+        home = np.floor(scaled).astype(np.int64)
+        past = scaled - home
+        inside = {-1: past <= reach, 0: np.ones(past.shape, dtype=np.bool_), 1: past >= 1.0 - reach}
         tiles, indices = [], []
-        for step in np.ndindex(3, 3):
-            tile = np.floor(scaled).astype(np.int64) + np.asarray(step) - 1
-            near = np.flatnonzero(np.all((scaled >= tile - reach) & (scaled <= tile + 1 + reach), axis=1))
-            tiles.append(tile[near])
+        for right, up in product(inside, inside):
+            near = np.flatnonzero(inside[right][:, 0] & inside[up][:, 1])
+            tiles.append(home[near] + (right, up))
             indices.append(near)
         tile, index = np.concatenate(tiles), np.concatenate(indices)
         order = np.lexsort((index, tile[:, 1], tile[:, 0]))
