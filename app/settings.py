@@ -25,7 +25,7 @@ class Settings(BaseSettings):
     port: int = Field(default=8300, ge=1, le=65535, description="port to listen on")
     max_upload_bytes: int = Field(default=64 * 2**20, description="largest survey body, before and after decompression")
     max_body_bytes: int = Field(default=4 * 2**20, description="largest JSON body")
-    max_window_samples: int = Field(default=2000, description="most samples in one window")
+    max_window_samples: int = Field(default=2000, ge=1, le=20_000, description="most samples in one window")
     grid_cache_bytes: int = Field(default=512 * 2**20, description="memory for maps held ready to answer")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
 

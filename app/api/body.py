@@ -50,65 +50,67 @@ async def read_upload(request: Request, max_bytes: int) -> bytes:
     """
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding in ("identity", ""):
-        return await _collect(request.stream(), max_bytes, lambda chunk: chunk)
-    if encoding == "gzip":
-        return await _gunzip(request.stream(), max_bytes)
-    if encoding == "zstd":
-        return await _unzstd(request.stream(), max_bytes)
+        return _unpack_by_magic(await _collect(request.stream(), max_bytes), max_bytes)
+    if encoding in _UNPACK:
+        return _UNPACK[encoding](await _collect(request.stream(), max_bytes), max_bytes)
     raise InvalidInput(
         f"Content-Encoding {encoding[:40]!r} is not understood",
         Fault("/header/content-encoding", "send identity, gzip or zstd"),
     )
 
 
-async def _gunzip(chunks: AsyncIterator[bytes], max_bytes: int) -> bytes:
-    unzip = zlib.decompressobj(wbits=31)
+def _unpack_by_magic(data: bytes, max_bytes: int) -> bytes:
+    """A packed file sent as it is, without saying so, is unpacked all the same."""
+    for magic, encoding in ((b"\x1f\x8b", "gzip"), (b"\x28\xb5\x2f\xfd", "zstd")):
+        if data.startswith(magic):
+            return _UNPACK[encoding](data, max_bytes)
+    return data
+
+
+def _gunzip(packed: bytes, max_bytes: int) -> bytes:
     out = bytearray()
-
-    def unpack(chunk: bytes) -> bytes:
-        nonlocal unzip
-        unpacked = bytearray()
-        while chunk:
-            unpacked += unzip.decompress(chunk, max_bytes + 1 - len(out) - len(unpacked))
-            if len(out) + len(unpacked) > max_bytes:
-                return bytes(unpacked)
-            if unzip.eof and unzip.unused_data:  # a file of several members
-                chunk, unzip = unzip.unused_data, zlib.decompressobj(wbits=31)
-            else:
-                chunk = unzip.unconsumed_tail
-        return bytes(unpacked)
-
     try:
-        async for chunk in chunks:
-            out += unpack(chunk)
+        while True:  # a file may have several members
+            unzip = zlib.decompressobj(wbits=31)
+            out += unzip.decompress(packed, max_bytes + 1 - len(out))
             _check(len(out), max_bytes)
+            if not unzip.eof:
+                raise _damaged("gzip", "the stream ends before its end mark")
+            packed = unzip.unused_data
+            if not packed:
+                return bytes(out)
     except zlib.error as error:
         raise _damaged("gzip", str(error)) from error
-    if not unzip.eof:
-        raise _damaged("gzip", "the stream ends before its end mark")
-    return bytes(out)
 
 
-async def _unzstd(chunks: AsyncIterator[bytes], max_bytes: int) -> bytes:
-    unzip = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj(read_across_frames=True)
-    packed = await _collect(chunks, max_bytes, lambda chunk: chunk)
-    out = bytearray()
+def _unzstd(packed: bytes, max_bytes: int) -> bytes:
+    out, frame, inside = bytearray(), None, False
     try:
         # Pieces bound the growth between checks: zstd packs at most about 1 : 20,000.
         for start in range(0, len(packed), 1024):
-            out += unzip.decompress(packed[start : start + 1024])
-            _check(len(out), max_bytes)
+            piece = packed[start : start + 1024]
+            while piece:  # a file may have several frames
+                if frame is None:
+                    frame = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
+                out += frame.decompress(piece)
+                _check(len(out), max_bytes)
+                inside = not frame.eof
+                piece = frame.unused_data if frame.eof else b""
+                frame = None if frame.eof else frame
     except zstandard.ZstdError as error:
         raise _damaged("zstd", str(error)) from error
-    if not unzip.eof and not out:
+    if inside or not packed:
         raise _damaged("zstd", "the stream ends before its end mark")
     return bytes(out)
 
 
-async def _collect(chunks: AsyncIterator[bytes], max_bytes: int, unpack: Callable[[bytes], bytes]) -> bytes:
+_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {"gzip": _gunzip, "zstd": _unzstd}
+
+
+async def _collect(chunks: AsyncIterator[bytes], max_bytes: int) -> bytes:
     out = bytearray()
     async for chunk in chunks:
-        out += unpack(chunk)
+        out += chunk
         _check(len(out), max_bytes)
     return bytes(out)
 

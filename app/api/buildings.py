@@ -9,6 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, MapWriting, Reading
+from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.listing import Page, PagingDep, list_page
@@ -132,10 +133,10 @@ def list_buildings(context: ContextDep, identity: Reading, paging: PagingDep) ->
         return list_page(session, mine, Building.id, paging, show_building)
 
 
-@router.get("/buildings/{building_id}", summary="One building")
-def get_building(building_id: Id, context: ContextDep, identity: Reading) -> BuildingView:
+@router.get("/buildings/{building_id}", response_model=BuildingView, summary="One building")
+def get_building(building_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
-        return show_building(find_building(session, identity, building_id))
+        return pointer(request, show_building(find_building(session, identity, building_id)))
 
 
 @router.post("/buildings/{building_id}/floors", status_code=201, response_model=FloorView, summary="Add a floor")
@@ -162,7 +163,7 @@ def list_floors(building_id: Id, context: ContextDep, identity: Reading, paging:
         return list_page(session, select(Floor).where(Floor.building_id == building_id), Floor.id, paging, show_floor)
 
 
-@router.get("/floors/{floor_id}", summary="One floor")
-def get_floor(floor_id: Id, context: ContextDep, identity: Reading) -> FloorView:
+@router.get("/floors/{floor_id}", response_model=FloorView, summary="One floor, and the map it answers with")
+def get_floor(floor_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
-        return show_floor(find_floor(session, identity, floor_id))
+        return pointer(request, show_floor(find_floor(session, identity, floor_id)))

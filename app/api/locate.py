@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 from sqlalchemy import select
 
 from app.api.auth import Identity, Locating
@@ -18,14 +18,15 @@ from app.geometry import rotate_by_quaternion
 from app.positioning.fix import Fix, LocateOptions, Prior
 from app.positioning.window import Window
 from app.services.locate_window import ActiveMap, active_maps, locate_window
+from app.survey.units import field_faults
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["locate"], responses=ERROR_RESPONSES)
 MAX_BATCH = 100
-MAX_SAMPLES = 2000
+MAX_SAMPLES = 20_000  # of the description; the setting max_window_samples refuses sooner
 
-Microtesla = Annotated[float, Field(allow_inf_nan=False, ge=-10_000, le=10_000)]
+Microtesla = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 Vector = Annotated[list[Microtesla], Field(min_length=3, max_length=3)]
 Quaternion = Annotated[list[Annotated[Finite, Field(ge=-2, le=2)]], Field(min_length=4, max_length=4)]
 Radians = Annotated[float, Field(allow_inf_nan=False, ge=-100.0, le=100.0)]
@@ -43,6 +44,31 @@ _EXAMPLE: dict[str, Any] = {
 }
 
 
+def _shape_of_field(value: object) -> str:
+    first = value[0] if isinstance(value, list) and value else None
+    return "magnitudes" if isinstance(first, (int, float)) else "vectors"
+
+
+_FLOOR_ID = "01a2014f-5d0e-7a53-8f2c-6f2f3d1a9b10"
+_EXAMPLE_FIX: dict[str, Any] = {
+    "status": "fix",
+    "reason": None,
+    "estimates": {
+        "ml": {"available": True, "floor_id": _FLOOR_ID, "position_m": [12.3, 4.5, 1.2], "heading_rad": 1.57,
+               "log_likelihood": -14.7},
+        "mlr": {"available": True, "ratio": 41.0, "floor_id": _FLOOR_ID, "position_m": [12.3, 4.5, 1.2]},
+        "abl": {"available": False, "reason": "the likelihood is spread out: its peak is 12 times the uniform share"},
+    },
+    "posterior": {
+        "floor_probability": {_FLOOR_ID: 1.0}, "floor_id": _FLOOR_ID, "position_m": [12.3, 4.5, 1.2],
+        "covariance_m2": [[0.02, 0.0], [0.0, 0.03]], "radius_68_m": 0.2, "radius_95_m": 0.5,
+        "modes": [{"floor_id": _FLOOR_ID, "position_m": [12.3, 4.5, 1.2], "heading_rad": 1.57, "probability": 0.99}],
+    },
+    "map_ids": ["01a20150-77aa-7d10-9c3e-0d8f5b2c4e11"],
+    "timing_ms": {"search": 12.1, "total": 14.0},
+}  # fmt: skip
+
+
 class WindowBody(RequestModel):
     """Samples in order of time. `displacement_m` is measured from the first sample."""
 
@@ -52,14 +78,18 @@ class WindowBody(RequestModel):
               "first sample, yaw unknown unless heading_rad is given; body: b in the sensor's axes with orientation; "
               "norm: b_ut is a flat list of |B|, displacement in the level frame"),
     ]  # fmt: skip
-    b_ut: Annotated[list[Vector] | list[Microtesla], Field(min_length=1, max_length=MAX_SAMPLES)]
+    b_ut: Annotated[
+        Annotated[list[Vector], Tag("vectors"), Field(min_length=1, max_length=MAX_SAMPLES)]
+        | Annotated[list[Microtesla], Tag("magnitudes"), Field(min_length=1, max_length=MAX_SAMPLES)],
+        Discriminator(_shape_of_field),
+    ]
     displacement_m: Annotated[list[Point], Field(min_length=1, max_length=MAX_SAMPLES)]
     t_s: Annotated[list[Finite], Field(max_length=MAX_SAMPLES)] | None = None
     orientation: Annotated[
         list[Quaternion] | None, Field(max_length=MAX_SAMPLES, description="body to building, [w, x, y, z]")
     ] = None
     heading_rad: Annotated[Radians | None, Field(description="yaw of the first sample's level frame")] = None
-    heading_sd_rad: Annotated[Annotated[Finite, Field(gt=0, le=10)] | None, Field()] = None
+    heading_sd_rad: Annotated[Finite, Field(ge=1e-4, le=10)] | None = None
     yaw_rad: Annotated[
         Annotated[list[Radians], Field(max_length=MAX_SAMPLES)] | None,
         Field(description="yaw of the device at each sample from the first; default: it turns with the path"),
@@ -76,6 +106,8 @@ class WindowBody(RequestModel):
         if isinstance(self.b_ut[0], list) == (self.frame == "norm"):
             shape = "a flat list of magnitudes" if self.frame == "norm" else "a list of [bx, by, bz]"
             raise ValueError(f"in the {self.frame} frame b_ut is {shape}")
+        if self.heading_sd_rad is not None and self.heading_rad is None:
+            raise ValueError("heading_sd_rad says how sure heading_rad is; send both or neither")
         if self.frame == "body" and self.orientation is None:
             raise ValueError("the body frame needs orientation: [[w, x, y, z], ...], body to building")
         return self
@@ -83,7 +115,7 @@ class WindowBody(RequestModel):
 
 class PriorBody(RequestModel):
     position_m: Point
-    sd_m: Annotated[Finite, Field(gt=0, le=10_000)]
+    sd_m: Annotated[Finite, Field(ge=1e-3, le=10_000)]
 
 
 class OptionsBody(RequestModel):
@@ -98,7 +130,7 @@ class OptionsBody(RequestModel):
 class LocateBody(RequestModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [_EXAMPLE]})
     window: WindowBody
-    composition: Literal["raw", "demeaned"] = "raw"
+    composition: Literal["raw", "demeaned", "differenced", "feature"] = "raw"
     techniques: Annotated[
         list[Literal["ml", "mlr", "abl"]],
         Field(min_length=1, max_length=3, default_factory=lambda: ["ml", "mlr", "abl"]),
@@ -133,7 +165,10 @@ class ModeView(BaseModel):
 
 
 class PosteriorView(BaseModel):
-    """The belief about where the device was at the last sample."""
+    """The belief about where the device was at the last sample.
+
+    Position, covariance and radii are those of the most probable floor, given that it is the right one.
+    """
 
     floor_probability: dict[str, float]
     floor_id: str
@@ -150,6 +185,7 @@ class Timing(BaseModel):
 
 
 class FixView(BaseModel):
+    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE_FIX]})
     status: Literal["fix", "ambiguous", "inconsistent", "unmapped"]
     reason: Annotated[str | None, Field(description="for every status but fix: what is wrong and what would help")]
     estimates: dict[Literal["ml", "mlr", "abl"], Estimate]
@@ -218,6 +254,9 @@ def _locate(context: Context, maps: list[ActiveMap], body: LocateBody, start: fl
     if len(body.window.b_ut) > context.settings.max_window_samples:
         limit = context.settings.max_window_samples
         raise InvalidWindow(f"the window has more than {limit} samples", Fault("/body/window/b_ut", "send fewer"))
+    if body.composition not in ("raw", "demeaned"):
+        offered = Fault("/body/composition", f"{body.composition} is not offered yet; use raw, or demeaned")
+        raise InvalidInput(offered.reason, offered)
     result = locate_window(
         maps,
         context.grids,
@@ -235,6 +274,15 @@ def _window(body: WindowBody) -> Window:
     """The window in one of the core's frames: a body window is turned to the building frame here."""
     B = np.asarray(body.b_ut, dtype=np.float64).reshape(len(body.b_ut), -1)
     frame = body.frame
+    norm_uT = B[:, 0] if frame == "norm" else np.linalg.norm(B, axis=1)
+    message, faults = field_faults(norm_uT, lambda sample: f"/body/window/b_ut/{sample}")
+    if message is not None:
+        raise InvalidWindow(message, *faults)
+    t_s = None if body.t_s is None else np.asarray(body.t_s)
+    if t_s is not None and (backwards := np.flatnonzero(np.diff(t_s) <= 0.0)).size:
+        at = int(backwards[0]) + 1
+        reason = f"{t_s[at]:g} s does not come after {t_s[at - 1]:g} s"
+        raise InvalidWindow("the window's time does not increase", Fault(f"/body/window/t_s/{at}", reason))
     if frame == "body":
         q = np.asarray(body.orientation, dtype=np.float64)
         norms = np.linalg.norm(q, axis=1)
@@ -250,7 +298,7 @@ def _window(body: WindowBody) -> Window:
         B_uT=B,
         displacement_m=np.asarray(body.displacement_m, dtype=np.float64),
         noise_uT=body.noise_ut,
-        t_s=None if body.t_s is None else np.asarray(body.t_s),
+        t_s=t_s,
         heading_rad=body.heading_rad,
         heading_sd_rad=body.heading_sd_rad,
         yaw_rad=None if body.yaw_rad is None else np.asarray(body.yaw_rad),

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, MapWriting, Reading
 from app.api.buildings import find_floor
+from app.api.caching import immutable, pointer
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
@@ -22,7 +23,7 @@ from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFou
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
 from app.services.artefacts import samples_from_bytes
-from app.services.export_map import MEDIA_TYPES, ExportFormat, export_map
+from app.services.export_map import MEDIA_TYPES, export_map
 
 __all__ = ["MapView", "router"]
 
@@ -35,12 +36,14 @@ class NewMap(RequestModel):
     """What to build; everything left out has a good default."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert"}]})
-    engine: Literal["hilbert", "exact"] = "hilbert"
+    engine: Literal["hilbert", "exact", "compromise"] = "hilbert"
     components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
     kernel: Literal["squared_exponential", "matern32", "matern52"] | None = None
-    curl_free: Annotated[Literal[False], Field(description="components are independent in this version")] = False
+    curl_free: Annotated[bool, Field(description="true is not offered yet: components are independent")] = False
     resolution_m: Annotated[Finite, Field(ge=0.05, le=5.0)] = 0.25
-    heights_m: Annotated[list[Metres], Field(min_length=1, max_length=1)] | None = None
+    heights_m: Annotated[
+        list[Metres], Field(min_length=1, max_length=100, description="one height; default: the samples' median")
+    ] | None = None  # fmt: skip
     survey_ids: Annotated[
         list[Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]], Field(min_length=1, max_length=10_000)
     ] | None = None  # fmt: skip
@@ -118,6 +121,19 @@ def _find_map(session: Session, identity: Identity, map_id: str) -> Map:
     return row
 
 
+def _check_offered(body: NewMap) -> None:
+    """Refuse what the contract names and this version does not have, one fault each."""
+    faults = []
+    if body.engine == "compromise":
+        faults.append(Fault("/body/engine", "compromise is not offered yet; use hilbert, or exact for small maps"))
+    if body.curl_free:
+        faults.append(Fault("/body/curl_free", "curl-free maps are not offered yet; leave it false"))
+    if body.heights_m is not None and len(body.heights_m) > 1:
+        faults.append(Fault("/body/heights_m", "maps of several heights are not offered yet; name one"))
+    if faults:
+        raise InvalidInput(faults[0].reason, *faults)
+
+
 def _check_surveys(session: Session, floor_id: str, body: NewMap) -> list[str]:
     """The surveys to build from, sorted; refuses what could only fail later."""
     statement = select(Survey.id, Survey.frame).where(Survey.floor_id == floor_id)
@@ -146,6 +162,8 @@ def create_map(
 ) -> Response:
     """A floor with `auto_build` builds by itself after each change; this builds with parameters of your own."""
 
+    _check_offered(body)
+
     def create(session: Session) -> tuple[int, BaseModel]:
         floor = find_floor(session, identity, floor_id)
         row = Map(
@@ -172,11 +190,11 @@ def list_maps(floor_id: Id, context: ContextDep, identity: Reading, paging: Pagi
         return list_page(session, mine, Map.id, paging, lambda row: show_map(row, active))
 
 
-@router.get("/maps/{map_id}", summary="One map: its state, score and parameters")
-def get_map(map_id: Id, context: ContextDep, identity: Reading) -> MapView:
+@router.get("/maps/{map_id}", response_model=MapView, summary="One map: its state, score and parameters")
+def get_map(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
         row = _find_map(session, identity, map_id)
-        return show_map(row, session.get_one(Floor, row.floor_id).active_map_id)
+        return pointer(request, show_map(row, session.get_one(Floor, row.floor_id).active_map_id))
 
 
 @router.post("/maps/{map_id}/activate", summary="Answer with this map from now on")
@@ -225,7 +243,7 @@ def get_quality(map_id: Id, request: Request, context: ContextDep, identity: Rea
         sha256 = row.quality_sha256
     if sha256 is None:
         raise NotFound(f"map {map_id} is {row.status}; it has no quality report yet")
-    return _immutable(request, sha256, lambda: context.blobs.get(sha256), "application/json")
+    return immutable(request, sha256, lambda: context.blobs.get(sha256), "application/json")
 
 
 @router.get(
@@ -235,11 +253,17 @@ def get_quality(map_id: Id, request: Request, context: ContextDep, identity: Rea
     responses={200: {"content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)}},
 )
 def get_export(
-    map_id: Id, request: Request, context: ContextDep, identity: Reading, format: Annotated[ExportFormat, Query()]
+    map_id: Id,
+    request: Request,
+    context: ContextDep,
+    identity: Reading,
+    format: Annotated[Literal["netcdf", "zarr", "npz", "covjson", "csv"], Query()],
 ) -> Response:
+    if format == "zarr":
+        raise InvalidInput("zarr is not offered yet", Fault("/query/format", f"use one of {', '.join(MEDIA_TYPES)}"))
     grid, sha256 = _ready_grid(context, identity, map_id)
     name = f'attachment; filename="isodyn-{sha256[:12]}.{ {"netcdf": "nc"}.get(format, format) }"'
-    response = _immutable(request, f"{sha256}-{format}", lambda: export_map(grid, format), MEDIA_TYPES[format])
+    response = immutable(request, f"{sha256}-{format}", lambda: export_map(grid, format), MEDIA_TYPES[format])
     response.headers["Content-Disposition"] = name
     return response
 
@@ -262,7 +286,7 @@ def get_heatmap(
     from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it
 
     grid, sha256 = _ready_grid(context, identity, map_id)
-    return _immutable(request, f"{sha256}-{layer}", lambda: heatmap_png(grid, layer), "image/png")
+    return immutable(request, f"{sha256}-{layer}", lambda: heatmap_png(grid, layer), "image/png")
 
 
 @router.get(
@@ -289,7 +313,7 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
         return static_view_html(grid, walks, title, rings, floor.elevation_m).encode()
 
     shown = sha256_of(" ".join([sha256, *(survey.id for survey in surveys)]).encode()).hexdigest()
-    return _immutable(request, shown, page, "text/html")
+    return immutable(request, shown, page, "text/html")
 
 
 def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
@@ -299,11 +323,3 @@ def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[Fiel
     if sha256 is None:
         raise Conflict(f"map {map_id} is {status}; it has no field yet")
     return context.grids.grid(floor_id, sha256), sha256
-
-
-def _immutable(request: Request, tag: str, make: Any, media_type: str) -> Response:
-    """A response that never changes: a strong ETag of its content's hash, 304 when the caller has it already."""
-    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, max-age=31536000, immutable"}
-    if f'"{tag}"' in request.headers.get("if-none-match", ""):
-        return Response(status_code=304, headers=headers)
-    return Response(make(), media_type=media_type, headers=headers)

@@ -37,6 +37,7 @@ from app.errors import (
 __all__ = ["ERROR_RESPONSES", "Forbidden", "Problem", "Unauthorised", "add_problem_handlers", "problem_response"]
 
 TYPE_BASE = "https://isodyn.dev/problems/"
+UNION_TAGS = frozenset({"vectors", "magnitudes"})  # of a window's b_ut: no part of a JSON pointer
 
 
 class Unauthorised(IsodynError):
@@ -116,6 +117,7 @@ def add_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_exception)
     app.add_exception_handler(OperationalError, _database_unavailable)
     app.add_exception_handler(DBAPIError, _database_refused)
+    app.add_exception_handler(Exception, _unexpected)
 
 
 def isodyn_problem(error: IsodynError) -> JSONResponse:
@@ -130,11 +132,18 @@ async def _isodyn_error(_: Request, error: Exception) -> JSONResponse:
     return isodyn_problem(error)
 
 
-async def _validation_error(_: Request, error: Exception) -> JSONResponse:
+async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    faults = [Fault("/" + "/".join(str(part) for part in each["loc"]), each["msg"]) for each in error.errors()]
+    not_json = "application/json" not in request.headers.get("content-type", "application/json")
+    faults = [_fault(each["loc"], each["msg"], not_json) for each in error.errors()]
     detail = f"{faults[0].location}: {faults[0].reason}" if faults else "the request does not fit its description"
     return problem_response(422, "invalid-input", "The request cannot be used", detail, faults[:50])
+
+
+def _fault(location: Sequence[str | int], reason: str, not_json: bool) -> Fault:
+    if not_json and tuple(location) == ("body",):
+        reason = "send the body as JSON, with the header Content-Type: application/json"
+    return Fault("/" + "/".join(str(part) for part in location if part not in UNION_TAGS), reason)
 
 
 async def _http_exception(_: Request, error: Exception) -> JSONResponse:
@@ -153,3 +162,9 @@ async def _database_unavailable(_: Request, error: Exception) -> JSONResponse:
 
 async def _database_refused(_: Request, error: Exception) -> JSONResponse:
     return problem_response(500, "internal", "Something went wrong here", "the database refused the statement")
+
+
+async def _unexpected(_: Request, error: Exception) -> JSONResponse:
+    """A fault of ours: the server's log has the traceback."""
+    detail = f"an unexpected {type(error).__name__}; the server's log says more, please report it"
+    return problem_response(500, "internal", "Something went wrong here", detail)

@@ -21,6 +21,8 @@ from app.api.models import Id, Name, RequestModel
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Floor, Map, Survey
 from app.errors import NotFound
+from app.field.spec import ComponentConsistency, SegmentConsistency
+from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
 from app.services.receive_survey import parse_survey, record_survey
 
@@ -89,6 +91,14 @@ def _find_survey(session: Session, identity: Identity, survey_id: str) -> Survey
     return row
 
 
+def _lock_survey(session: Session, identity: Identity, survey_id: str) -> Survey:
+    """The survey, read again once its floor is locked: whoever came first has changed or deleted it."""
+    survey = _find_survey(session, identity, survey_id)
+    lock_floor(session, survey.floor_id)
+    session.expunge(survey)
+    return _find_survey(session, identity, survey_id)
+
+
 @router.post(
     "/floors/{floor_id}/surveys",
     status_code=202,
@@ -154,6 +164,22 @@ def get_report(survey_id: Id, context: ContextDep, identity: SurveyReading) -> d
         return _find_survey(session, identity, survey_id).report
 
 
+class ConsistencyView(BaseModel):
+    """One survey against the map of *the other* surveys, whole and in segments, per component (Kuevor B14)."""
+
+    survey_id: str
+    map_id: str
+    status: Annotated[
+        Literal["consistent", "inconsistent", "unjudged"], Field(description="unjudged: nothing else was measured near")
+    ]
+    seed_2sigma_96: Annotated[bool | None, Field(description="at least 96 % of errors within 2 sd, every component")]
+    judged_samples: int
+    nlpd: float | None
+    components: list[ComponentConsistency]
+    segments: list[SegmentConsistency]
+    reason: str | None
+
+
 @router.get("/surveys/{survey_id}/consistency", summary="How the survey fits the map of the others (Kuevor B14)")
 def get_consistency(
     survey_id: Id,
@@ -162,8 +188,7 @@ def get_consistency(
     map_id: Annotated[
         str | None, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$", description="default: the floor's active map")
     ] = None,
-) -> dict[str, Any]:
-    """The survey against the map of *the other* surveys, whole and in segments, per component."""
+) -> ConsistencyView:
     with context.transaction() as session:
         survey = _find_survey(session, identity, survey_id)
         wanted = map_id or session.scalars(select(Floor.active_map_id).where(Floor.id == survey.floor_id)).one()
@@ -174,7 +199,7 @@ def get_consistency(
     report = json.loads(context.blobs.get(quality_sha256))["surveys"].get(survey_id)
     if report is None:
         raise NotFound(f"survey {survey_id} is not part of map {map_id}")
-    return {"survey_id": survey_id, "map_id": map_id, **report}
+    return ConsistencyView(survey_id=survey_id, map_id=map_id, **report)
 
 
 @router.get("/surveys/{survey_id}/samples", summary="The samples as the map sees them")
@@ -201,7 +226,7 @@ def get_samples(
 @router.patch("/surveys/{survey_id}", summary="Leave a survey out of maps, or take it in again")
 def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> SurveyView:
     with context.transaction() as session:
-        survey = _find_survey(session, identity, survey_id)
+        survey = _lock_survey(session, identity, survey_id)
         changed, survey.included = survey.included != body.included, body.included
         session.flush()
         if changed:
@@ -213,7 +238,7 @@ def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity
 def delete_survey(survey_id: Id, context: ContextDep, identity: SurveyWriting) -> Response:
     """Maps already built keep what they learned from it; the next build does not have it."""
     with context.transaction() as session:
-        survey = _find_survey(session, identity, survey_id)
+        survey = _lock_survey(session, identity, survey_id)
         floor_id = survey.floor_id
         session.delete(survey)
         session.flush()
@@ -222,8 +247,11 @@ def delete_survey(survey_id: Id, context: ContextDep, identity: SurveyWriting) -
 
 
 def _rebuild(session: Session, context: Context, floor_id: str) -> None:
-    """Set off a rebuild if the floor builds by itself and has anything left to build from."""
+    """Set off a rebuild if the floor builds by itself; with nothing left to build from it has no map any more."""
     floor = session.get_one(Floor, floor_id)
-    left = session.scalars(select(Survey.id).where(Survey.floor_id == floor_id, Survey.included).limit(1)).first()
-    if floor.auto_build and left is not None:
+    if not floor.auto_build:
+        return
+    if session.scalars(select(Survey.id).where(Survey.floor_id == floor_id, Survey.included).limit(1)).first():
         context.queue.enqueue_rebuild(session, floor)
+    else:
+        floor.active_map_id, floor.active_sequence = None, floor.build_sequence

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from app.cli.environment import read_settings
 from app.settings import Settings
 
 __all__ = ["Finding", "doctor", "examine"]
@@ -32,7 +33,7 @@ class Finding:
 
 def doctor() -> None:
     """Look at Python, disk, database, blobs, worker and port; say what is wrong and what to do."""
-    findings = examine(Settings())
+    findings = examine(read_settings())
     table = Table("", "what", "seen", "what to do", show_lines=False)
     marks = {True: "[green]ok[/green]", None: "[yellow]note[/yellow]", False: "[red]wrong[/red]"}
     for finding in findings:

@@ -1,20 +1,20 @@
 """`isodyn keys`: make, list and revoke API keys, on the database itself."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.cli.environment import read_settings, say_refusals
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.db.tables import Key, Organisation
-from app.errors import IsodynError
 from app.services.manage_keys import SCOPES, create_key, revoke_key
-from app.settings import Settings
 
 __all__ = ["commands"]
 
@@ -23,16 +23,13 @@ commands = typer.Typer(help="Make, list and revoke API keys.", no_args_is_help=T
 
 @contextmanager
 def _database() -> Iterator[Session]:
-    settings = Settings()
+    settings = read_settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     engine = create_database_engine(settings.resolved_database_url)
     migrate(engine)
     try:
-        with session_factory(engine).begin() as session:
+        with say_refusals(), session_factory(engine).begin() as session:
             yield session
-    except IsodynError as error:
-        Console(stderr=True).print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from error
     finally:
         engine.dispose()
 
@@ -52,7 +49,7 @@ def create(
 @commands.command("list")
 def list_keys() -> None:
     """List keys: whose, what for, what they may do."""
-    table = Table("id", "organisation", "name", "scopes", "created", "revoked")
+    table = Table(Column("id", no_wrap=True), "organisation", "name", "scopes", "created", "revoked")
     with _database() as session:
         rows = session.execute(
             select(Key, Organisation.name).join(Organisation, Organisation.id == Key.organisation_id).order_by(Key.id)
@@ -60,7 +57,7 @@ def list_keys() -> None:
         for key, organisation in rows:
             revoked = f"{key.revoked_at:%Y-%m-%d}" if key.revoked_at else ""
             table.add_row(key.id, organisation, key.name, ", ".join(key.scopes), f"{key.created_at:%Y-%m-%d}", revoked)
-    Console().print(table)
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 
 @commands.command()

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -11,6 +12,8 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+
+from app.cli.environment import read_settings, say_refusals
 
 __all__ = ["openapi", "serve", "worker"]
 
@@ -26,12 +29,14 @@ def serve(
     import uvicorn
 
     from app.main import create_app, first_start
-    from app.settings import Settings
 
-    settings = Settings()
+    settings = read_settings()
     settings = settings.model_copy(update={"host": host or settings.host, "port": port or settings.port})
-    made = first_start(settings)
     console = Console(stderr=True, highlight=False)
+    _check_port(settings.host, settings.port)
+    with say_refusals():
+        made = first_start(settings)
+        app = create_app(settings)
     if made is not None:
         console.print(f"[bold]Admin key (shown this once, keep it):[/bold] {made}", soft_wrap=True)
     # uvicorn stops gracefully on SIGTERM and then raises it again: let that end here, past the worker's farewell.
@@ -41,7 +46,7 @@ def serve(
         supervisor.start()
     try:
         console.print(f"Isodyn listens on http://{settings.host}:{settings.port} (page: /view/, contract: /docs)")
-        uvicorn.run(create_app(settings), host=settings.host, port=settings.port, log_level="warning",
+        uvicorn.run(app, host=settings.host, port=settings.port, log_level="warning",
                     timeout_graceful_shutdown=10)  # fmt: skip
     finally:
         if supervisor is not None:
@@ -50,13 +55,12 @@ def serve(
 
 def worker() -> None:
     """Run one worker: it takes jobs from the database until it is stopped."""
-    from app.main import first_start
-    from app.settings import Settings
     from workers.main import run_worker
 
-    settings = Settings()
-    first_start(settings)
-    run_worker(settings)
+    settings = read_settings()
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    with say_refusals():
+        run_worker(settings)
 
 
 def openapi(
@@ -76,6 +80,20 @@ def openapi(
         print(document)
     else:
         output.write_text(document + "\n")
+
+
+def _check_port(host: str, port: int) -> None:
+    """End the command if somebody listens there already."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            Console(stderr=True, highlight=False).print(
+                f"[red]cannot listen on {host}:{port}: {error.strerror}[/red]; choose another with --port or --host"
+            )
+            raise typer.Exit(2) from error
 
 
 class WorkerSupervisor:

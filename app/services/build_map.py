@@ -34,8 +34,8 @@ def claim_build(session: Session, job_id: str) -> Plan:
     now = datetime.now(UTC)
     map_row = session.get(Map, job.map_id) if job.map_id else None
     if map_row is None:  # a rebuild makes its map row when it starts
-        map_row = Map(organisation_id=job.organisation_id, floor_id=job.floor_id, status="running", spec={},
-                      survey_ids=[], created_at=now)  # fmt: skip
+        map_row = Map(organisation_id=job.organisation_id, floor_id=job.floor_id, status="running",
+                      spec=_active_spec(session, job.floor_id), survey_ids=[], created_at=now)  # fmt: skip
         session.add(map_row)
         session.flush()
         job.map_id = map_row.id
@@ -97,13 +97,12 @@ def publish_build(session: Session, job_id: str, plan: Plan, result: Result) -> 
     for name in ("grid_sha256", "quality_sha256", "components", "bounds_m", "hyperparameters", "score", "score_reason"):
         setattr(map_row, name, result[name])
     map_row.status, map_row.finished_at = "ready", datetime.now(UTC)
-    activated = map_row.activate and session.execute(
-        update(Floor)
-        .where(Floor.id == plan["floor_id"], Floor.active_sequence < plan["sequence"])
-        .values(active_map_id=map_row.id, active_sequence=plan["sequence"])
-        .returning(Floor.id)
-    ).first() is not None  # fmt: skip
-    _end(job, "successful", "the map is ready" + (" and active" if activated else ""))
+    floor = session.get_one(Floor, plan["floor_id"], with_for_update=True)
+    if map_row.activate and floor.active_sequence < plan["sequence"]:
+        floor.active_map_id, floor.active_sequence = map_row.id, plan["sequence"]
+    activated = floor.active_map_id == map_row.id
+    overtaken = "; a newer map, or one chosen by hand, stays active" if map_row.activate else ""
+    _end(job, "successful", "the map is ready" + (" and active" if activated else overtaken))
     job.progress = 100
     job.result = {"map_id": map_row.id, "sha256": map_row.grid_sha256, "activated": activated}
 
@@ -137,6 +136,12 @@ def _job(session: Session, job_id: str) -> Job:
     if job is None:
         raise NotFound(f"no job {job_id}")
     return job
+
+
+def _active_spec(session: Session, floor_id: str) -> dict[str, Any]:
+    """The parameters of the floor's active map: a rebuild keeps what somebody once asked for."""
+    active = session.get_one(Floor, floor_id).active_map_id
+    return dict(session.get_one(Map, active).spec) if active else {}
 
 
 def _wanted_surveys(session: Session, floor_id: str, map_row: Map) -> list[str]:

@@ -51,10 +51,13 @@ def create_key(
 def ensure_admin_key(session: Session, wanted: str | None) -> str | None:
     """At start: make the wanted admin key if it is not there, or one of our own if there is no key at all.
 
-    Returns a key only when one was made here that nobody has seen yet.
+    Returns a key only when one was made here that nobody has seen yet. Raises InvalidInput for a revoked one.
     """
     if wanted:
-        if recognise_key(session, wanted) is None:
+        known = session.execute(select(Key.revoked_at).where(Key.sha256 == _digest(wanted))).one_or_none()
+        if known is not None and known.revoked_at is not None:
+            raise InvalidInput("the key in ISODYN_ADMIN_KEY was revoked; set another, or leave it unset")
+        if known is None:
             create_key(session, organisation="default", name="admin (settings)", scopes=["admin"], secret=wanted)
         return None
     if session.scalars(select(Key.id).limit(1)).first() is not None:

@@ -66,5 +66,6 @@ def test_the_service_keeps_its_contract(app: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_the_service_keeps_its_contract_at_length(app: Any) -> None:
     assert sum(check_contract(app, examples=300).values()) > 10_000

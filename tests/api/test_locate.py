@@ -136,6 +136,9 @@ BAD_WINDOWS: dict[str, dict[str, Any]] = {
     "zero quaternion": {"frame": "body", "orientation": [[0, 0, 0, 0]] * 24},
     "no noise": {"noise_ut": 0},
     "misspelt": {"headingrad": 1.0},
+    "time going backwards": {"t_s": [0.0, 1.0, 0.5, *range(2, 23)]},
+    "how sure, but not of what": {"heading_sd_rad": 0.1},
+    "negative magnitudes": {"frame": "norm", "b_ut": [-50.0] * 24},
     "huge": {"b_ut": [[1e300, 0, 0]] * 24},
 }
 
@@ -148,6 +151,33 @@ def test_a_bad_window_is_refused_with_where_and_why(
     answer = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body})
     assert answer.status_code == 422, answer.text
     assert answer.json()["errors"][0]["location"].startswith("/body")
+
+
+def test_a_window_in_the_wrong_unit_says_which_unit_it_looks_like(
+    service: Any, mapped_floor: str, window: Callable[..., Any]
+) -> None:
+    body = window()[0]
+    body["b_ut"] = (1000 * np.array(body["b_ut"])).tolist()
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body})
+    assert answer.status_code == 422
+    assert "nanotesla" in answer.text
+    assert answer.json()["errors"][0]["location"] == "/body/window/b_ut/0"
+
+
+@pytest.mark.parametrize("composition", ["differenced", "feature"])
+def test_what_the_contract_names_and_is_not_there_yet_says_so(
+    service: Any, mapped_floor: str, window: Callable[..., Any], composition: str
+) -> None:
+    body = {"window": window()[0], "composition": composition}
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/locate", json=body)
+    assert answer.status_code == 422
+    assert "not offered yet" in answer.json()["detail"]
+
+
+def test_json_without_its_content_type_says_so(service: Any, mapped_floor: str) -> None:
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/locate", content=b"{}", headers={"Content-Type": "text/x"})
+    assert answer.status_code == 422
+    assert "Content-Type: application/json" in answer.text
 
 
 @pytest.mark.parametrize("word", ["NaN", "Infinity", "1e999"])

@@ -161,3 +161,21 @@ def test_an_older_build_never_replaces_a_newer_one(
             publish_build(session, jobs[k], plans[k], results[k])
     assert service.http.get(f"/v1/floors/{floor}").json()["active_map_id"] == plans[1]["map_id"]
     assert results[0]["grid_sha256"] == results[1]["grid_sha256"], "the same surveys give the same map"
+
+
+@pytest.mark.parametrize("body", [{"engine": "compromise"}, {"curl_free": True}, {"heights_m": [1.0, 2.0]}])
+def test_what_is_not_offered_yet_says_so(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body)
+    assert answer.status_code == 422
+    assert "not offered yet" in answer.json()["detail"]
+    assert answer.json()["errors"][0]["location"] == f"/body/{next(iter(body))}"
+
+
+def test_pointers_have_etags_that_follow_their_state(service: Any, mapped_floor: str, active_map: str) -> None:
+    for path in (f"/v1/floors/{mapped_floor}", f"/v1/maps/{active_map}"):
+        first = service.http.get(path)
+        assert "max-age=" in first.headers["cache-control"]
+        etag = first.headers["etag"]
+        for sent in (etag, f'"other", W/{etag}', "*"):
+            assert service.http.get(path, headers={"If-None-Match": sent}).status_code == 304
+        assert service.http.get(path, headers={"If-None-Match": '"other"'}).status_code == 200

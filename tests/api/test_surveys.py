@@ -54,6 +54,65 @@ def test_compressed_bodies_are_the_same_survey(
     assert first.json()["survey"] == again.json()["survey"]
 
 
+def test_packed_files_are_unpacked_without_being_told(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor, data = new_floor(), walk_csv(6)
+    packed = [gzip.compress(data[:900]) + gzip.compress(data[900:]), zstandard.compress(data), data]
+    answers = [service.http.post(f"/v1/floors/{floor}/surveys", content=each) for each in packed]
+    assert [a.status_code for a in answers] == [202, 200, 200]
+
+
+def test_a_zstd_stream_cut_at_a_line_is_not_half_a_survey(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor, data = new_floor(), walk_csv(6)
+    half = data.rindex(b"\n", 0, len(data) // 2) + 1
+    packer = zstandard.ZstdCompressor().compressobj()
+    cut = packer.compress(data[:half]) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+    answer = service.http.post(f"/v1/floors/{floor}/surveys", content=cut, headers={"Content-Encoding": "zstd"})
+    assert answer.status_code == 422, answer.text
+    assert service.http.get(f"/v1/floors/{floor}/surveys").json()["items"] == []
+
+
+def test_racing_changes_of_a_survey_end_in_order(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor(auto_build=False)
+    survey = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1)).json()["survey"]["id"]
+    statuses = []
+
+    def change(k: int) -> None:
+        url = f"/v1/surveys/{survey}"
+        answer = service.http.delete(url) if k % 2 else service.http.patch(url, json={"included": k % 4 == 0})
+        statuses.append(answer.status_code)
+
+    threads = [threading.Thread(target=change, args=(k,)) for k in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(statuses) <= {200, 204, 404}, statuses
+    assert statuses.count(204) == 1
+
+
+def test_a_floor_whose_last_survey_goes_has_no_map(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor()
+    survey = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1)).json()["survey"]["id"]
+    service.run_jobs()
+    assert service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
+    service.http.delete(f"/v1/surveys/{survey}")
+    assert service.http.get(f"/v1/floors/{floor}").json()["active_map_id"] is None
+
+
+def test_a_rebuild_keeps_the_parameters_of_the_active_map(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor()
+    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
+    wanted = {"resolution_m": 0.5, "kernel": "squared_exponential"}
+    assert service.http.post(f"/v1/floors/{floor}/maps", json=wanted).status_code == 202
+    service.run_jobs()
+    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(2))
+    service.run_jobs()
+    active = service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
+    rebuilt = service.http.get(f"/v1/maps/{active}").json()
+    assert (len(rebuilt["survey_ids"]), rebuilt["resolution_m"]) == (2, 0.5)
+    assert rebuilt["hyperparameters"]["kernel"] == "squared_exponential"
+
+
 def test_concurrent_uploads_of_the_same_bytes_make_one_survey(
     service: Any, new_floor: NewFloor, walk_csv: Walk
 ) -> None:
@@ -129,6 +188,8 @@ def test_corrupt_files_of_other_formats_are_refused(service: Any, mapped_floor: 
         (gzip.compress(b"hello")[:-6], {"Content-Encoding": "gzip"}, 422),
         (b"not gzip", {"Content-Encoding": "gzip"}, 422),
         (zstandard.compress(b"hello" * 100)[:-3], {"Content-Encoding": "zstd"}, 422),
+        (zstandard.compress(b"hello" * 100_000)[:-3], {}, 422),
+        (gzip.compress(b"0" * 2**22), {}, 413),
         (zlib.compress(b"hello"), {"Content-Encoding": "br"}, 422),
     ],
 )

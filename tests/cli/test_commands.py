@@ -2,15 +2,21 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from sqlalchemy import update
 from typer.testing import CliRunner
 
 from app.cli import main
 from app.cli.doctor import examine
+from app.db.engine import create_database_engine
+from app.db.tables import Key, utc_now
+from app.errors import InvalidInput
+from app.main import first_start
 from app.settings import Settings
 
 runner = CliRunner()
@@ -44,12 +50,12 @@ def test_keys_are_made_shown_once_listed_and_revoked(data_dir: Path) -> None:
     assert key.encode() not in (data_dir / "isodyn.db").read_bytes()
     key_id = next(word for word in listed.output.replace("│", " ").split() if word.count("-") == 4 and len(word) == 36)
     assert runner.invoke(main, ["keys", "revoke", key_id]).exit_code == 0
-    assert runner.invoke(main, ["keys", "revoke", "nobody"]).exit_code == 1
+    assert runner.invoke(main, ["keys", "revoke", "nobody"]).exit_code == 2
 
 
 def test_an_unknown_scope_is_refused_with_the_known_ones(data_dir: Path) -> None:
     result = runner.invoke(main, ["keys", "create", "x", "--scope", "everything"])
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "map:read" in result.output
 
 
@@ -83,6 +89,38 @@ def test_openapi_is_written(data_dir: Path, tmp_path: Path) -> None:
     document = json.loads((tmp_path / "openapi.json").read_text())
     assert "/v1/buildings/{building_id}/locate" in document["paths"]
     assert document["components"]["schemas"]["LocateBody"]["examples"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [("PORT", "99999", "ISODYN_PORT"), ("BLOB_URL", "s3://bucket", "s3"), ("DATABASE_URL", "mysql://x/y", "mysql")],
+)
+def test_a_wrong_setting_is_one_sentence(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, said: str
+) -> None:
+    monkeypatch.setenv(f"ISODYN_{name}", value)
+    result = runner.invoke(main, ["serve", *([] if name == "PORT" else ["--port", "18399"])])
+    assert result.exit_code == 2, result.output
+    assert said in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_taken_port_is_one_sentence(data_dir: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        result = runner.invoke(main, ["serve", "--port", str(taken.getsockname()[1])])
+    assert result.exit_code == 2
+    assert "--port" in result.output
+
+
+def test_a_revoked_admin_key_stops_the_start_with_a_sentence(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ISODYN_ADMIN_KEY", "isd_wanted")
+    first_start(Settings())
+    with create_database_engine(Settings().resolved_database_url).begin() as connection:
+        connection.execute(update(Key).values(revoked_at=utc_now()))
+    with pytest.raises(InvalidInput, match="revoked"):
+        first_start(Settings())
 
 
 def test_an_unreachable_server_is_one_sentence(data_dir: Path, tmp_path: Path) -> None:

@@ -1,0 +1,37 @@
+"""Settings and refusals as a person at a terminal sees them: a sentence, never a traceback."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+
+from app.errors import IsodynError
+from app.settings import Settings
+
+__all__ = ["read_settings", "say_refusals"]
+
+
+def read_settings() -> Settings:
+    """The settings of the environment; ends the command with one line per wrong variable."""
+    try:
+        return Settings()
+    except ValidationError as error:
+        for fault in error.errors():
+            _complain(f"ISODYN_{str(fault['loc'][0]).upper()}={fault['input']}: {fault['msg']}")
+        raise typer.Exit(2) from error
+
+
+@contextmanager
+def say_refusals() -> Iterator[None]:
+    """End the command with the error's own sentence."""
+    try:
+        yield
+    except IsodynError as error:
+        _complain(str(error))
+        raise typer.Exit(2) from error
+
+
+def _complain(sentence: str) -> None:
+    Console(stderr=True, highlight=False).print(f"[red]{sentence}[/red]", soft_wrap=True)
