@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import IO, Any
 
@@ -22,6 +23,7 @@ __all__ = ["FitFailed", "FitProcessDied", "run_fit"]
 
 LOOK_EVERY_S = 0.25
 CANCEL_GRACE_S = 2.0
+MAX_SILENCE_S = 1800.0  # far above the longest step of a fit between two words of progress
 ORPHANED = 4
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "BLIS", "VECLIB")}
 
@@ -36,11 +38,11 @@ class FitProcessDied(Exception):
     """The child ended without a result: killed, out of memory, or unable to start. Worth another try."""
 
 
-def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress) -> Result:
+def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress, silence_s: float = MAX_SILENCE_S) -> Result:
     """Run `fit_build` of the module `builder` in a child process and return its result.
 
     `report` is called from this thread with the last progress, also while the fit is silent; what it raises stops
-    the child. Raises FitFailed, FitProcessDied.
+    the child. A fit that makes no progress for `silence_s` counts as dead. Raises FitFailed, FitProcessDied.
     """
     child = subprocess.Popen(
         [sys.executable, "-m", "workers.fit_process"],
@@ -51,17 +53,20 @@ def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress) -> Result
     )
     try:
         _tell(child, json.dumps({"builder": builder, "plan": plan, "blob_url": blob_url}))
-        return _listen(child, report)
+        return _listen(child, report, silence_s)
     finally:
         _stop(child)
 
 
-def _listen(child: subprocess.Popen[bytes], report: Progress) -> Result:
-    fraction, message = 0.0, "starting"
+def _listen(child: subprocess.Popen[bytes], report: Progress, silence_s: float) -> Result:
+    fraction, message, heard = 0.0, "starting", time.monotonic()
     for line in _lines_or_pauses(child):
         if line is None:
             report(fraction, message)
+            if time.monotonic() - heard > silence_s:
+                raise FitProcessDied(f"the fit made no progress for {silence_s:,.0f} s and was stopped")
             continue
+        heard = time.monotonic()
         said: dict[str, Any] = json.loads(line)
         if "result" in said:
             result: Result = said["result"]
