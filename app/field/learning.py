@@ -28,7 +28,7 @@ LEARNABLE = (8.0, 1.0)
 """A tile can tell lengths between an eighth of its pitch (its functions are no finer) and all of it (its size)."""
 LARGE_OFFSET = 0.01
 """Above this share of the signal's variance offsets and correlated errors are worth wide tiles, to be told from it."""
-GOOD_ENOUGH = 1.5
+GOOD_ENOUGH = 1.7
 """A lattice whose pitch is within this factor of the suited one learns the same length."""
 
 TRIED_FIRST = (WalkNoise(variance_ratio=0.3, length_m=1.5), WalkNoise(variance_ratio=10.0, length_m=5.0))

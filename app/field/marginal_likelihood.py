@@ -28,7 +28,7 @@ SCALE_FLOOR_UT2 = 1e-6
 LENGTH_BOUNDS_M = (0.3, 40.0)
 RATIO_BOUNDS_LOG = np.log([(1e-6, 1e2), (1e-8, 1e1)])
 MAX_ITERATIONS = 40
-TOLERANCE = 1e-5
+TOLERANCE = 3e-5
 """Relative gain of an iteration below which the search ends; the objective is the value per observation, about one."""
 START_LOG = np.log([3.0, 1e-2, 1e-4])
 

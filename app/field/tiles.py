@@ -26,7 +26,7 @@ cost least; only wide ones can tell a long length, or a survey's offset in the t
 MARGIN = 0.3
 OVERLAP = 0.1
 FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 14, "matern32": 15}
-WIDE_FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 20, "matern32": 22}
+WIDE_FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 20, "matern32": 23}
 
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""

@@ -16,8 +16,8 @@ from app.field.tiles import Lattice
 AMBIENT = np.array([18.0, 3.0, -44.0])
 
 
-def fit(walks, hyper, frame):
-    lattice = Lattice.for_length(hyper.kernel, hyper.length_m)
+def fit(walks, hyper, frame, wide=False):
+    lattice = Lattice.for_length(hyper.kernel, hyper.length_m, wide)
     tiled = TiledWalks(lattice, walks, AMBIENT)
     blended = BlendedField(lattice, frame, 3)
     for tile in tiled.counts():
@@ -30,14 +30,15 @@ def fit(walks, hyper, frame):
     return blended
 
 
+@pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize(
     ("kernel", "length_m"), [("squared_exponential", 1.2), ("matern52", 1.8), ("matern32", 2.6), ("matern32", 2.0)]
 )
-def test_mean_and_sd_agree_with_the_exact_process(room, kernel, length_m):
+def test_mean_and_sd_agree_with_the_exact_process(room, kernel, length_m, wide):
     walks = observe(room.lanes(np.random.default_rng(1), surveys=2), "vector")
     hyper = Hyperparameters(kernel, length_m, np.full(3, 2.5), white_ratio=0.01)
     frame = GridFrame(np.arange(0.5, room.width_m - 0.25, 0.5), np.arange(0.5, room.depth_m - 0.25, 0.5), 0.0)
-    blended = fit(walks, hyper, frame)
+    blended = fit(walks, hyper, frame, wide)
 
     position = np.concatenate([walk.position_m for walk in walks])
     target = np.concatenate([walk.field_uT for walk in walks]) - AMBIENT
