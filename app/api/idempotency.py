@@ -62,7 +62,7 @@ def answer_once(
             return JSONResponse(content, status)
         except IntegrityError:  # somebody else used the key, or created the same object, a moment earlier
             if attempt == 2:
-                raise Conflict("the same request is being served at this moment; try again") from None
+                raise
     raise AssertionError("unreachable")
 
 

@@ -103,6 +103,27 @@ def _engine_of(database: Engine | str) -> Iterator[Engine]:
         engine.dispose()
 
 
+def _unixepoch(modifier: str) -> float | None:
+    """`unixepoch('subsec')` of SQLite 3.42: the seconds since 1970, such that a thousand times it is whole."""
+    if modifier != "subsec":
+        return None
+    milliseconds = int(time.time() * 1000)
+    while (milliseconds / 1000) * 1000 != milliseconds:
+        milliseconds -= 1
+    return milliseconds / 1000
+
+
+def _teach_old_sqlite(connection: object, _record: object) -> None:
+    if isinstance(connection, sqlite3.Connection):
+        connection.create_function("unixepoch", 1, _unixepoch)
+
+
+if sqlite3.sqlite_version_info < (3, 42):
+    # The job engine goes by Python's version, not SQLite's: on Python 3.12 with an older SQLite (Debian 12) its
+    # timestamps would be NULL. Every engine of the process, because it makes its own.
+    event.listen(Engine, "connect", _teach_old_sqlite)
+
+
 def _prepare_sqlite_connection(connection: sqlite3.Connection, _record: object) -> None:
     # FULL: an acknowledged commit survives a power cut, also in WAL.
     for pragma in ("foreign_keys = ON", f"busy_timeout = {int(BUSY_TIMEOUT_S * 1000)}", "synchronous = FULL"):

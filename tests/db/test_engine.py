@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -110,3 +111,14 @@ def test_a_savepoint_set_first_belongs_to_the_transaction(sessions: sessionmaker
 def test_addresses_that_are_not_offered_say_so(url: str) -> None:
     with pytest.raises(InvalidInput, match="database address"):
         create_database_engine(url)
+
+
+def test_sqlite_knows_the_time_to_the_millisecond_whatever_its_version(sqlite_url: str) -> None:
+    """Python 3.12 and newer may come with an SQLite that does not; the job engine stores such times as integers."""
+    engine = create_database_engine(sqlite_url)
+    with engine.connect() as connection:
+        for _ in range(200):
+            now_ms = connection.scalar(text("SELECT unixepoch('subsec') * 1000"))
+            assert now_ms == int(now_ms)
+            assert abs(now_ms / 1000 - time.time()) < 5.0
+    engine.dispose()
