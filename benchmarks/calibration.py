@@ -19,7 +19,7 @@ from app.field.fit import fit_map
 from app.field.grid import FieldGrid
 from app.field.spec import MapSpec
 from app.positioning.floors import SearchableFloor
-from app.positioning.locate import locate, prepare_floor
+from app.positioning.locate import locate, prepare_floors
 from app.synthetic.building import SyntheticBuilding, make_building
 from app.synthetic.sensors import Magnetometer, survey, window
 from app.synthetic.walks import lawn_mower, random_waypoints
@@ -114,7 +114,7 @@ def main() -> int:
         print(
             f"floor {k}: noise {noise} uT, map sd {sd:.2f} uT, errors correlate over {grid.error_correlation_m:.2f} m"
         )
-    floors = [prepare_floor(str(k), grid) for k, grid in enumerate(grids)]
+    floors = prepare_floors({str(k): grid for k, grid in enumerate(grids)})
     return report(located(building, floors, given.windows, rng))
 
 

@@ -319,7 +319,7 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
 def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
     with context.transaction() as session:
         row = _find_map(session, identity, map_id)
-        floor_id, sha256, status = row.floor_id, row.grid_sha256, row.status
+        sha256, status = row.grid_sha256, row.status
     if sha256 is None:
         raise Conflict(f"map {map_id} is {status}; it has no field yet")
-    return context.grids.grid(floor_id, sha256), sha256
+    return context.grids.grid(sha256), sha256

@@ -1,5 +1,6 @@
 """A floor made ready for searching: its field as features, padded with the prior, under min/max pyramids."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,9 @@ from app.field.samples import Components
 from app.geometry import Array
 from app.positioning.features import reduce_field, reduce_variance
 
-__all__ = ["TOP_LEVEL", "Plane", "SearchableFloor", "prepare_floor", "reduce_floor"]
+__all__ = [
+    "TOP_LEVEL", "Plane", "SearchableFloor", "prepare_floor", "prepare_floors", "reduce_floor", "shared_noise_sd_uT",
+]  # fmt: skip
 
 TOP_LEVEL = 5  # the search starts from blocks of 2^5 cells
 Float32 = NDArray[np.float32]
@@ -21,8 +24,8 @@ Float32 = NDArray[np.float32]
 class Plane:
     """One layer of a floor's grid, as features.
 
-    mean_uT, variance_uT2  (ny + 2, nx + 2, c): the field and the variance of one measurement about it (map sd and map
-                           noise together), one cell of prior on each side; unmeasured cells hold the prior
+    mean_uT, variance_uT2  (ny + 2, nx + 2, c): the field and the variance of one measurement about it (map sd and the
+                           floor's noise together), one cell of prior on each side; unmeasured cells hold the prior
     measured               (ny, nx)
     ambient_uT, off_map_variance_uT2   (c,) the same where there is no map
     gradient_uT_per_m      rms gradient of the features over the measured cells
@@ -51,11 +54,16 @@ class Plane:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchableFloor:
-    """A floor's map and what the search needs of it; immutable, to be cached behind the map's content hash."""
+    """A floor's map and what the search needs of it; immutable, to be cached behind the map's content hash and noise.
+
+    noise_sd_uT  (c_grid,) sd of one measurement about the field, per component of the grid: the map's own noise, or
+                 the one shared with the floors it is compared with
+    """
 
     floor_id: str
     grid: FieldGrid
     components: Components
+    noise_sd_uT: Array
     planes: tuple[Plane, ...]
 
     @property
@@ -64,24 +72,50 @@ class SearchableFloor:
         return self.grid.nbytes + sum(plane.nbytes for plane in self.planes)
 
 
-def prepare_floor(floor_id: str, grid: FieldGrid) -> SearchableFloor:
-    """Planes and pyramids of a map with its own components: tens of milliseconds per 100 x 100 m at 0.25 m."""
-    return _prepare(floor_id, grid, grid.components)
+def prepare_floor(floor_id: str, grid: FieldGrid, noise_sd_uT: Array | None = None) -> SearchableFloor:
+    """Planes and pyramids of a map with its own components: tens of milliseconds per 100 x 100 m at 0.25 m.
+
+    `noise_sd_uT` (c,) replaces the noise the map learned, for floors that are compared with each other.
+    """
+    return _prepare(floor_id, grid, grid.components, grid.noise_sd_uT if noise_sd_uT is None else noise_sd_uT)
 
 
-def reduce_floor(floor: SearchableFloor, components: Components) -> SearchableFloor:
-    """The same floor on poorer features (Kuevor B12 for the norm); itself when they are already its own."""
-    return floor if floor.components == components else _prepare(floor.floor_id, floor.grid, components)
+def prepare_floors(grids: Mapping[str, FieldGrid]) -> list[SearchableFloor]:
+    """Floors, by id, that are to be searched together: all under the noise they share."""
+    noise_sd_uT = shared_noise_sd_uT(list(grids.values()))
+    return [prepare_floor(floor_id, grid, noise_sd_uT) for floor_id, grid in grids.items()]
 
 
-def _prepare(floor_id: str, grid: FieldGrid, components: Components) -> SearchableFloor:
-    planes = tuple(_plane(grid, layer, components) for layer in range(len(grid.heights_m)))
-    return SearchableFloor(floor_id, grid, components, planes)
+def shared_noise_sd_uT(grids: Sequence[FieldGrid]) -> Array | None:
+    """The noise (c,) under which maps are compared: per component the largest that one of them claims.
+
+    None (each keeps its own) for one map alone and for maps of different components.
+
+    A likelihood rewards the map that claims the least noise wherever residuals are small, and forgives most where the
+    claim is large, so that floors would be told apart by what their maps claim instead of by the field.
+    """
+    if len(grids) < 2 or len({grid.components for grid in grids}) > 1:
+        return None
+    return np.asarray(np.max([grid.noise_sd_uT for grid in grids], axis=0))
 
 
-def _plane(grid: FieldGrid, layer: int, components: Components) -> Plane:
+def reduce_floor(floor: SearchableFloor, components: Components, noise_sd_uT: Array | None = None) -> SearchableFloor:
+    """The same floor on poorer features (Kuevor B12 for the norm) or under another noise (c_grid,) of the grid's own
+    components; itself when it is already so."""
+    noise = floor.noise_sd_uT if noise_sd_uT is None else noise_sd_uT
+    if floor.components == components and np.array_equal(noise, floor.noise_sd_uT):
+        return floor
+    return _prepare(floor.floor_id, floor.grid, components, noise)
+
+
+def _prepare(floor_id: str, grid: FieldGrid, components: Components, noise_sd_uT: Array) -> SearchableFloor:
+    planes = tuple(_plane(grid, layer, components, noise_sd_uT) for layer in range(len(grid.heights_m)))
+    return SearchableFloor(floor_id, grid, components, noise_sd_uT, planes)
+
+
+def _plane(grid: FieldGrid, layer: int, components: Components, noise_sd_uT: Array) -> Plane:
     source, measured = grid.components, grid.measured[layer]
-    noise = np.square(grid.noise_sd_uT)
+    noise = np.square(noise_sd_uT)
     mean = np.where(measured[..., None], grid.mean_uT[layer], grid.ambient_uT).astype(np.float64)
     sd = np.where(measured[..., None], grid.sd_uT[layer], grid.prior_sd_uT).astype(np.float64)
     variance = reduce_variance(mean, np.square(sd) + noise, source, components)

@@ -1,7 +1,7 @@
 """One-shot positioning: a window against the maps of the candidate floors, to a fix with its uncertainty.
 
-`prepare_floor` once per map (cache it behind the map's content hash), then `locate` per window. Pure and deterministic:
-no clock, no randomness, nothing kept.
+`prepare_floors` once per set of maps (cache the floors behind the maps' content hashes and noise), then `locate` per
+window. Pure and deterministic: no clock, no randomness, nothing kept.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from app.field.grid import FieldGrid
 from app.positioning.belief import believe
 from app.positioning.features import common_components
 from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlrEstimate, Prior
-from app.positioning.floors import SearchableFloor, prepare_floor, reduce_floor
+from app.positioning.floors import SearchableFloor, prepare_floor, prepare_floors, reduce_floor, shared_noise_sd_uT
 from app.positioning.matching import match
 from app.positioning.verdict import conclude
 from app.positioning.window import Composition, Window
 
-__all__ = ["SearchableFloor", "locate", "prepare_floor", "warm_up"]
+__all__ = ["SearchableFloor", "locate", "prepare_floor", "prepare_floors", "shared_noise_sd_uT", "warm_up"]
 
 TECHNIQUES = ("ml", "mlr", "abl")
 
@@ -36,6 +36,8 @@ def locate(
 
     Maximum likelihood always answers; MLR and ABL only where they may (Shockley 8.1-8.3), and say why not. `prior` is a
     Gaussian on the position of the last sample, in all three axes. An estimate not in `techniques` is unavailable.
+    Several floors of the same components are compared under one noise (`shared_noise_sd_uT`); `prepare_floors` has them
+    so at once, otherwise they are prepared again here.
     Raises InvalidWindow, IncompatibleFrames (a map cannot answer this frame), InvalidInput (prior or options).
     """
     options = options or LocateOptions()
@@ -52,7 +54,8 @@ def locate(
             None,
         )
     shared = common_components(window.frame, {floor.floor_id: floor.components for floor in floors})
-    ready = [reduce_floor(floor, shared) for floor in floors]
+    noise_sd_uT = shared_noise_sd_uT([floor.grid for floor in floors])
+    ready = [reduce_floor(floor, shared, noise_sd_uT) for floor in floors]
     matched = match(window, ready, shared, composition == "demeaned", prior, options)
     return conclude(matched, believe(matched, options), techniques, options)
 

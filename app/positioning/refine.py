@@ -118,7 +118,7 @@ def _residuals(floor: SearchableFloor, plane: Plane, window: ReducedWindow, pose
     x, y = pose[:, :1] + east, pose[:, 1:2] + north
     values = grid.at(np.stack([x.ravel(), y.ravel(), np.full(x.size, plane.height_m)], axis=1))
     shape = (*x.shape, -1)
-    total = values.sd_uT**2 + grid.noise_sd_uT**2
+    total = values.sd_uT**2 + floor.noise_sd_uT**2
     variance = reduce_variance(values.mean_uT, total, source, target).reshape(shape)
     variance = np.maximum(variance, 1e-6) + window.noise_variance_uT2[:, None]
     slope = field_jacobian(values.mean_uT, source, target) @ values.gradient_uT_per_m

@@ -26,7 +26,7 @@ from app.field.session_bias import SessionBias, estimate_session_biases, remove_
 from app.field.spec import FittedMap, MapSpec, Score
 from app.geometry import Array, rotate_by_quaternion
 from app.positioning.fix import Fix, LocateOptions
-from app.positioning.locate import SearchableFloor, locate, prepare_floor
+from app.positioning.locate import SearchableFloor, locate, prepare_floor, prepare_floors
 from app.positioning.window import Composition, Window
 from app.survey.read import read_survey
 from app.survey.walk import DeadReckoning, Walk
@@ -269,14 +269,16 @@ def _fit_floor(walks: Mapping[str, Samples], spec: MapSpec) -> FittedMap:
 
 
 _floors: list[SearchableFloor] = []
+_floor_alone: dict[str, SearchableFloor] = {}
 _plan = EvaluationPlan()
 
 
 def _ready_to_locate(grids: Mapping[str, Any], plan: EvaluationPlan) -> None:
-    """Once per child process: the floors ready for searching."""
+    """Once per child process: the floors ready for searching, together and each alone."""
     global _plan
     _one_thread()
-    _floors[:] = [prepare_floor(floor_id, grid) for floor_id, grid in grids.items()]
+    _floors[:] = prepare_floors(grids)
+    _floor_alone.update((floor_id, prepare_floor(floor_id, grid)) for floor_id, grid in grids.items())
     _plan = plan
 
 
@@ -286,7 +288,7 @@ def _judge_walk(floor_id: str, name: str, walk: Walk, mapped_m: Array) -> list[J
     p_m = walk.samples.p_building_m[:, :2]
     distance_m, _ = cKDTree(mapped_m).query(p_m)
     near = np.asarray(distance_m) <= COVERED_WITHIN_M
-    right_floor = [floor for floor in _floors if floor.floor_id == floor_id]
+    right_floor = [_floor_alone[floor_id]]
     judged = []
     for length_m in _plan.window_lengths_m:
         for part, window in cut_windows(walk.dead_reckoning, length_m):

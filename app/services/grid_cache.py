@@ -1,53 +1,117 @@
-"""Maps held ready to answer: an LRU of searchable floors, bounded by bytes, keyed by content hash."""
+"""Maps held ready to answer: an LRU of grids and searchable floors, bounded by bytes, keyed by content hash."""
 
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from threading import Lock
 
 from app.blobs import BlobStore
 from app.field.grid import FieldGrid
-from app.positioning.locate import SearchableFloor, prepare_floor
+from app.geometry import Array
+from app.positioning.locate import SearchableFloor, prepare_floor, shared_noise_sd_uT
 from app.services.artefacts import grid_from_bytes
 
 __all__ = ["GridCache"]
 
+_Entry = FieldGrid | SearchableFloor
+_Key = tuple[str, str, bytes]  # floor id ("": the grid itself), hash of the grid, noise of the floor (b"": its own)
+
 
 class GridCache:
-    """A grid never changes under its hash, so an entry never goes stale; the oldest used is dropped when full."""
+    """A grid never changes under its hash, so an entry never goes stale; the least recently used is dropped when full.
+
+    A grid is held once, however many floors were prepared from it: alone, and under each noise shared with others.
+    """
 
     def __init__(self, blobs: BlobStore, capacity_bytes: int) -> None:
         self._blobs = blobs
         self._capacity_bytes = capacity_bytes
-        self._entries: OrderedDict[tuple[str, str], SearchableFloor] = OrderedDict()
-        self._loading: dict[tuple[str, str], Lock] = {}
+        self._entries: OrderedDict[_Key, _Entry] = OrderedDict()
+        self._loading: dict[_Key, Future[_Entry]] = {}
         self._lock = Lock()
 
-    def grid(self, floor_id: str, sha256: str) -> FieldGrid:
+    def grid(self, sha256: str) -> FieldGrid:
         """The grid under a hash. Raises NotFound, CorruptArtefact."""
-        return self.searchable(floor_id, sha256).grid
+        entry = self._held(_grid_key(sha256), lambda: grid_from_bytes(self._blobs.get(sha256)))
+        assert isinstance(entry, FieldGrid)
+        return entry
 
-    def searchable(self, floor_id: str, sha256: str) -> SearchableFloor:
-        """The grid under a hash with its search pyramids; several callers at once load it once."""
-        key = (floor_id, sha256)
+    def searchable(self, maps: Sequence[tuple[str, str]]) -> list[SearchableFloor]:
+        """The floors of maps (floor id, hash of the grid) that are searched together, under the noise they share.
+
+        Raises NotFound, CorruptArtefact.
+        """
+        grids = [self.grid(sha256) for _, sha256 in maps]
+        noise_sd_uT = shared_noise_sd_uT(grids)
+        return [
+            self._floor(floor_id, sha256, grid, noise_sd_uT)
+            for (floor_id, sha256), grid in zip(maps, grids, strict=True)
+        ]
+
+    def _floor(self, floor_id: str, sha256: str, grid: FieldGrid, noise_sd_uT: Array | None) -> SearchableFloor:
+        key = (floor_id, sha256, b"" if noise_sd_uT is None else noise_sd_uT.tobytes())
+        entry = self._held(key, lambda: prepare_floor(floor_id, grid, noise_sd_uT))
+        assert isinstance(entry, SearchableFloor)
+        return entry
+
+    def _held(self, key: _Key, load: Callable[[], _Entry]) -> _Entry:
+        """The entry under a key; several callers at once load it once, and share the error if that fails."""
         with self._lock:
             if key in self._entries:
-                self._entries.move_to_end(key)
+                self._touch(key)
                 return self._entries[key]
-            loading = self._loading.setdefault(key, Lock())
-        with loading:
+            mine = key not in self._loading
+            loading = self._loading.setdefault(key, Future())
+        if not mine:
+            return loading.result()
+        try:
+            entry = load()
+        except BaseException as error:
             with self._lock:
-                if key in self._entries:
-                    return self._entries[key]
-            floor = prepare_floor(floor_id, grid_from_bytes(self._blobs.get(sha256)))
-            with self._lock:
-                self._entries[key] = floor
-                self._loading.pop(key, None)
-                while len(self._entries) > 1 and self.nbytes > self._capacity_bytes:
-                    self._entries.popitem(last=False)
-        return floor
+                del self._loading[key]
+            loading.set_exception(error)
+            raise
+        with self._lock:
+            self._keep(key, entry)
+            del self._loading[key]
+        loading.set_result(entry)
+        return entry
+
+    def _keep(self, key: _Key, entry: _Entry) -> None:
+        """Hold an entry (and the grid it stands on), then drop what was used longest ago until all fits."""
+        self._entries[key] = entry
+        if isinstance(entry, SearchableFloor):
+            self._entries.setdefault(_grid_key(key[1]), entry.grid)
+        self._touch(key)
+        just_used = {key, _grid_key(key[1])}
+        while self._bytes() > self._capacity_bytes and len(self._entries) > len(just_used):
+            self._entries.popitem(last=False)
+
+    def _touch(self, key: _Key) -> None:
+        """A floor's grid counts as used after the floor, so that it is never dropped while a floor stands on it."""
+        self._entries.move_to_end(key)
+        self._entries.move_to_end(_grid_key(key[1]))
+
+    def _bytes(self) -> int:
+        grids: dict[int, int] = {}
+        planes = 0
+        for entry in self._entries.values():
+            grid = entry if isinstance(entry, FieldGrid) else entry.grid
+            grids[id(grid)] = grid.nbytes
+            planes += 0 if isinstance(entry, FieldGrid) else sum(plane.nbytes for plane in entry.planes)
+        return sum(grids.values()) + planes
 
     @property
     def nbytes(self) -> int:
-        return sum(floor.nbytes for floor in self._entries.values())
+        """Bytes of all that is held."""
+        with self._lock:
+            return self._bytes()
 
     def __len__(self) -> int:
-        return len(self._entries)
+        """How many maps are held, whatever was prepared from them."""
+        with self._lock:
+            return sum(isinstance(entry, FieldGrid) for entry in self._entries.values())
+
+
+def _grid_key(sha256: str) -> _Key:
+    return "", sha256, b""

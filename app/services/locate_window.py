@@ -67,7 +67,7 @@ def locate_window(
     options: LocateOptions,
 ) -> LocateResult:
     """Match a window against maps. Raises InvalidWindow, IncompatibleFrames."""
-    floors = [cache.searchable(each.floor_id, each.grid_sha256) for each in maps]
+    floors = cache.searchable([(each.floor_id, each.grid_sha256) for each in maps])
     start = perf_counter()
     fix = locate(window, floors, composition=composition, techniques=techniques, prior=prior, options=options)
     return LocateResult(fix, tuple(each.map_id for each in maps), 1e3 * (perf_counter() - start))

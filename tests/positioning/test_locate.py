@@ -10,7 +10,7 @@ from app.errors import IncompatibleFrames, InvalidInput, InvalidWindow
 from app.field.grid import FieldGrid
 from app.geometry import wrap_angle_rad, yaw_matrix
 from app.positioning.fix import Fix, LocateOptions, Prior
-from app.positioning.locate import locate, prepare_floor, warm_up
+from app.positioning.locate import locate, prepare_floor, prepare_floors, shared_noise_sd_uT, warm_up
 from app.positioning.window import Window
 
 
@@ -119,6 +119,40 @@ def test_floors_are_told_apart_and_probabilities_sum_to_one(grid_of: Callable, w
     assert fix.posterior.floor_probability["first"] > 0.99
     assert sum(mode.probability for mode in fix.posterior.modes) <= 1.0 + 1e-9
     assert fix.posterior.radius_68_m <= fix.posterior.radius_95_m
+
+
+def test_a_floor_does_not_win_by_claiming_less_noise(grid_of: Callable, walk_on: Callable) -> None:
+    """A map that claims a tenth of the noise gains ln 10 per number in its likelihood: not under one noise for all."""
+    rng = np.random.default_rng(61)
+    right, wrong = (grid_of(rng, (60, 60), heights_m=(z,), field_sd_uT=1.5, map_sd_uT=0.1) for z in (1.2, 5.2))
+    grids = {
+        "right": dataclasses.replace(right, noise_sd_uT=np.full(3, 10.0)),
+        "boasting": dataclasses.replace(wrong, noise_sd_uT=np.full(3, 1.0)),
+    }
+    window = walk_on(rng, right, length_m=6.0, samples=16).window
+    own = [prepare_floor(name, grid) for name, grid in grids.items()]
+    claimed = [locate(window, [floor]).ml for floor in own]
+    assert claimed[0] is not None
+    assert claimed[1] is not None
+    assert claimed[1].log_likelihood > claimed[0].log_likelihood, (
+        "under its own noise the wrong floor explains it better"
+    )
+    fix = locate(window, prepare_floors(grids))
+    assert fix.ml is not None
+    assert fix.ml.floor_id == "right"
+    assert locate(window, own).ml == fix.ml, "however the floors were prepared"
+
+
+def test_noise_is_shared_by_maps_of_the_same_components_alone(grid_of: Callable) -> None:
+    rng = np.random.default_rng(62)
+    quiet, loud, level = grid_of(rng, noise_sd_uT=3.0), grid_of(rng, noise_sd_uT=4.0), grid_of(rng, components="level")
+    shared = shared_noise_sd_uT([quiet, loud])
+    np.testing.assert_array_equal(shared, 4.0)
+    assert shared_noise_sd_uT([quiet]) is None
+    assert shared_noise_sd_uT([quiet, level]) is None
+    alone, together = prepare_floor("a", quiet), prepare_floors({"a": quiet, "b": loud})[0]
+    difference = together.planes[0].variance_uT2 - alone.planes[0].variance_uT2
+    np.testing.assert_allclose(difference, 16.0 - 9.0, rtol=1e-4)
 
 
 def test_maps_of_unlike_components_are_compared_on_what_they_share(grid_of: Callable, walk_on: Callable) -> None:
