@@ -12,24 +12,26 @@ import numpy as np
 
 from app.geometry import Array
 
-__all__ = ["NOMINAL_COVERAGE", "noise_sd_by_survey", "noise_sd_shown"]
+__all__ = ["LEAST_SHARE", "NOMINAL_COVERAGE", "noise_sd_by_survey", "noise_sd_shown"]
 
 NOMINAL_COVERAGE = 0.9545
 FEWEST_SURVEYS = 3
 FEWEST_SAMPLES = 200
+LEAST_SHARE = 0.7
+"""Of the believed sd: where surveys are sparse, an overstated latent variance explains errors that noise made."""
 
 
 def noise_sd_shown(needed_uT2: Sequence[Array], believed_sd_uT: Array) -> Array:
     """(c,) noise sd that covers held-out errors as it should; what was believed, when too few were held out.
 
     needed_uT2: per survey (n, c), the noise variance with which each judged error would lie at two predictive sds:
-    `error^2 / 4 - latent variance`.
+    `error^2 / 4 - latent variance`. The answer is at least LEAST_SHARE of what was believed.
     """
     judged = [needed for needed in needed_uT2 if len(needed)]
     if len(judged) < FEWEST_SURVEYS or sum(map(len, judged)) < FEWEST_SAMPLES:
         return believed_sd_uT
     variance_uT2 = np.quantile(np.concatenate(judged), NOMINAL_COVERAGE, axis=0)
-    return np.asarray(np.sqrt(np.maximum(variance_uT2, np.square(0.1 * believed_sd_uT))))
+    return np.asarray(np.sqrt(np.maximum(variance_uT2, np.square(LEAST_SHARE * believed_sd_uT))))
 
 
 def noise_sd_by_survey(needed_uT2: Mapping[str, Array], believed_sd_uT: Array) -> dict[str, Array]:

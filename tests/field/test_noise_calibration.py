@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from app.field.noise_calibration import noise_sd_by_survey, noise_sd_shown
+from app.field.noise_calibration import LEAST_SHARE, noise_sd_by_survey, noise_sd_shown
 
-BELIEVED = np.array([0.1, 5.0])
+BELIEVED = np.array([0.1, 1.3])
 
 
 def needed(rng, noise_sd, surveys=4, n=3000, latent=0.25):
@@ -26,3 +26,10 @@ def test_a_survey_is_not_scored_with_its_own_errors():
     all_needed = needed(np.random.default_rng(0), 1.0)
     all_needed["0"] = all_needed["0"] + 100.0
     assert noise_sd_by_survey(all_needed, BELIEVED)["0"] == pytest.approx([1.0, 1.0], rel=0.05)
+
+
+def test_sparse_surveys_do_not_talk_the_noise_away():
+    """Where the latent variance is overstated, errors ask for no noise at all: most of the belief stays."""
+    overstated = {name: n - 2.0 for name, n in needed(np.random.default_rng(0), 1.0).items()}
+    shown = noise_sd_shown(list(overstated.values()), BELIEVED)
+    assert shown == pytest.approx(LEAST_SHARE * BELIEVED)
