@@ -7,14 +7,13 @@ import numpy as np
 from app.geometry import Array
 from app.positioning.fix import LocateOptions
 from app.positioning.lattice import turn_window
-from app.positioning.likelihood import window_likelihood
 from app.positioning.matching import Matched
+from app.positioning.off_map import off_map
 from app.positioning.posterior import Atoms, cell_atoms, find_modes, replace_narrow_mode, untold_variance_m2
 from app.positioning.refine import Refined, refine_poses
 
 __all__ = ["Belief", "BelievedMode", "believe"]
 
-OFF_MAP_PRIOR = 0.1  # how likely, before the window is looked at, it was walked where nothing is mapped
 _MODES = 8
 _HEAVY_POSES = 2000  # enough poses to judge how much of the window was measured
 
@@ -73,8 +72,8 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
         BelievedMode(int(found.plane[k]), r.pose[0], float(r.log_l[0]), float(r.distance2[0]), float(s))
         for k, r, s in zip(peaks, refined, share, strict=True)
     ]
-    off_map = _off_map(matched)
-    nowhere, poor = off_map.mass / (off_map.mass + total), _poorly_measured(matched, relative)
+    elsewhere = off_map(matched)
+    nowhere, poor = elsewhere.mass / (elsewhere.mass + total), _poorly_measured(matched, relative)
     atoms.mass = atoms.mass / total
     return Belief(
         atoms=atoms,
@@ -82,8 +81,8 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
         best=modes[0],
         lattice_mass=relative / relative.sum(),
         unmapped=nowhere + (1.0 - nowhere) * poor,
-        off_map_distance2=off_map.distance2,
-        off_map_scalars=off_map.scalars,
+        off_map_distance2=elsewhere.distance2,
+        off_map_scalars=elsewhere.scalars,
         missed=found.missed_mass / (found.missed_mass + total),
     )
 
@@ -127,36 +126,6 @@ def _mode_masses(atoms: Atoms, centres: list[tuple[int, Array]], reach_m: float)
     nearest = np.argmin(distance, axis=0)
     near = distance[nearest, np.arange(len(nearest))] < reach_m
     return np.asarray(np.bincount(nearest[near], weights=atoms.mass[near], minlength=len(centres)), dtype=np.float64)
-
-
-@dataclass(frozen=True, slots=True)
-class _OffMap:
-    """The hypothesis that none of this is mapped: its mass in units of the best pose's, and how the prior field fits.
-
-    `distance2` is of the best heading, scaled to the `scalars` independent numbers that so smooth a field has to offer.
-    """
-
-    mass: float
-    distance2: float
-    scalars: float
-
-
-def _off_map(matched: Matched) -> _OffMap:
-    plane, window = matched.planes[int(matched.candidates.plane[0])], matched.window
-    turned = turn_window(window, matched.headings_rad, plane.resolution_m)
-    variance = plane.off_map_variance_uT2 + window.noise_variance_uT2[:, None]
-    fit = window_likelihood(turned.features_uT - plane.ambient_uT, variance, matched.demeaned)
-    heading = np.exp(matched.pose_prior.heading_log)
-    relative = np.exp(np.clip((fit.log_l - matched.candidates.score[0]) / matched.temper, -700, 700))
-    odds = OFF_MAP_PRIOR / (1.0 - OFF_MAP_PRIOR)
-    smooth_m = float(np.sqrt(2.0 * plane.off_map_variance_uT2.sum())) / max(plane.gradient_uT_per_m, 1e-6)
-    n, c = window.features_uT.shape
-    independent = min(float(n), 1.0 + float(window.path_m[-1] - window.path_m[0]) / (2.0 * smooth_m))
-    return _OffMap(
-        mass=float(odds * matched.prior_mass * (heading @ relative) / heading.sum()),
-        distance2=float(fit.distance2.min()) * independent / n,
-        scalars=independent * c,
-    )
 
 
 def _poorly_measured(matched: Matched, relative: Array) -> float:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from app.errors import Fault, InvalidInput
 from app.field.samples import Components
 from app.geometry import Array
 from app.positioning.features import window_features
@@ -18,6 +19,9 @@ __all__ = ["ReducedWindow", "Turned", "effective_samples", "heading_lattice", "r
 
 MIN_HEADINGS, MAX_HEADINGS = 72, 720
 DECORRELATED_SHARE = 0.12
+UNKNOWN_CORRELATION_M = 2.0  # what errors of a map are taken to correlate over when a single survey cannot tell
+MOST_SAMPLES = 200  # of a reduced window: fifty metres at 0.25 m
+LEAST_HEADING_SD_RAD = 1e-4
 _HEADING_PRIOR_SDS = 4.5  # how far a heading prior is searched
 
 
@@ -53,16 +57,20 @@ class Turned:
 
 
 def reduce_window(window: Window, components: Components, spacing_m: float) -> ReducedWindow:
-    """Average the samples within each `spacing_m` walked: standing still adds no position information."""
+    """Average the samples within each `spacing_m` walked: standing still adds no position information.
+
+    Of more than `MOST_SAMPLES` averages, that many are kept, evenly spaced, the first and the last among them.
+    """
     displacement = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(displacement, axis=0), axis=1))])
     bins = np.floor(path / spacing_m + 1e-9).astype(np.int64)
     _, group, count = np.unique(bins, return_inverse=True, return_counts=True)
+    kept = np.unique(np.linspace(0, len(count) - 1, min(len(count), MOST_SAMPLES)).round().astype(np.int64))
     return ReducedWindow(
-        features_uT=_group_means(window_features(window, components), group, count),
-        from_last_m=_group_means(displacement - displacement[-1], group, count),
-        noise_variance_uT2=window.noise_uT**2 / count,
-        path_m=_group_means(path[:, None], group, count)[:, 0],
+        features_uT=_group_means(window_features(window, components), group, count)[kept],
+        from_last_m=_group_means(displacement - displacement[-1], group, count)[kept],
+        noise_variance_uT2=window.noise_uT**2 / count[kept],
+        path_m=_group_means(path[:, None], group, count)[kept, 0],
         components=components,
         turns=components == "vector" and window.frame == "level",
     )
@@ -71,8 +79,15 @@ def reduce_window(window: Window, components: Components, spacing_m: float) -> R
 def heading_lattice(window: Window, step_rad: float) -> Array:
     """Yaws of the window's frame to search, (h,), at most `step_rad` apart; a building window has the one yaw zero.
 
-    A heading with an sd is searched within 4.5 sd, one without is believed.
+    A heading with an sd is searched within 4.5 sd, one without (or with an sd of zero) is believed.
+    Raises InvalidInput for an sd below 1e-4.
     """
+    if window.heading_sd_rad and window.heading_sd_rad < LEAST_HEADING_SD_RAD:
+        raise InvalidInput(
+            f"heading_sd_rad is {window.heading_sd_rad:g}: no heading is known that well; give at least "
+            f"{LEAST_HEADING_SD_RAD:g}, or leave it out to have the heading believed",
+            Fault("/window/heading_sd_rad", f"must be at least {LEAST_HEADING_SD_RAD:g}"),
+        )
     if window.frame == "building":
         return np.zeros(1)
     reach = np.pi
@@ -104,11 +119,11 @@ def effective_samples(path_m: Array, correlation_m: float, share: float = DECORR
 
     One per `share` of the correlation length walked. A position follows from differences of the field along the walk,
     whose errors decorrelate several times faster than the errors themselves: the default is what calibrates
-    (benchmarks/calibration.py).
+    (benchmarks/calibration.py). A correlation of zero means unknown, and is taken as two metres.
     """
     n = float(len(path_m))
     if correlation_m <= 0.0:
-        return n
+        correlation_m = UNKNOWN_CORRELATION_M
     return min(n, 1.0 + float(path_m[-1] - path_m[0]) / (share * correlation_m))
 
 

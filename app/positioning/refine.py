@@ -68,13 +68,19 @@ def refine_poses(
     temper: float,
     demeaned: bool,
 ) -> Refined:
-    """Refine poses (m, 3) on one plane by damped Gauss-Newton, each for itself, in eight steps at most."""
+    """Refine poses (m, 3) on one plane by damped Gauss-Newton, each for itself, in eight steps at most.
+
+    Positions stay on the plane's grid: outside it nothing was searched.
+    """
     pose = pose.astype(np.float64).copy()
+    low = np.array(plane.origin_m)
+    high = low + plane.resolution_m * (np.array(plane.shape[::-1]) - 1)
     here = _linearise(floor, plane, window, pose, prior, temper, demeaned)
     damping = np.full(len(pose), 1e-3)
     for _ in range(_STEPS):
-        step = _damped_step(here, prior, damping, plane.resolution_m)
-        trial = pose + step
+        trial = pose + _damped_step(here, prior, damping, plane.resolution_m)
+        trial[:, :2] = np.clip(trial[:, :2], low, high)
+        step = trial - pose
         there = _linearise(floor, plane, window, trial, prior, temper, demeaned)
         better = there.objective > here.objective
         pose[better] = trial[better]

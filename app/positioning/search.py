@@ -2,7 +2,8 @@
 
 Returns the pose an exhaustive scan would return, and every pose within a window of it (see `kernels` for the bound).
 A beam of promising blocks finds a good incumbent first; then every level of blocks is bounded, pruned and split, all
-headings at once. What was pruned is bounded too: `missed_mass` says how much posterior it could hold at most.
+headings at once. What was pruned is bounded too: `missed_mass` says how much posterior it could hold at most. The work
+is limited by a budget, counted and not timed: where it ends first, fewer blocks are followed, the others but bounded.
 """
 
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from app.errors import Fault, InvalidInput
 from app.geometry import Array
 from app.positioning.floors import TOP_LEVEL, Plane
 from app.positioning.kernels import block_bounds, pose_costs
@@ -20,6 +22,10 @@ __all__ = ["CAPACITY", "Candidates", "PosePrior", "search"]
 
 Blocks = NDArray[np.int32]
 CAPACITY = 400_000  # poses kept at most
+LEAST_PRIOR_SD_M = 1e-3
+BUDGET = 400_000_000  # values compared per plane at most: poses or blocks, times samples, times components
+_DEMEANED_BOUND_WORK = 3  # a bound over all offsets costs as much as so many plain ones
+_TOP_SHARE = 0.25  # of the budget, for the blocks the search starts from
 _BLOCKS_PER_POSE = 2  # how many blocks of a level may be followed, per pose of the capacity
 _BEAM = 48
 _DEMEANED_TOP_LEVEL = 3  # larger blocks than this an offset nearly always explains
@@ -34,11 +40,21 @@ class PosePrior:
 
     position_m, sd_m   None: flat
     heading_log        (h,) log density of each heading up to a constant
+
+    Raises InvalidInput for an sd below a millimetre.
     """
 
     position_m: tuple[float, float, float] | None
     sd_m: float
     heading_log: Array
+
+    def __post_init__(self) -> None:
+        if not self.sd_m >= LEAST_PRIOR_SD_M:
+            raise InvalidInput(
+                f"the prior's sd_m is {self.sd_m:g}: no position is known that well; give at least "
+                f"{LEAST_PRIOR_SD_M:g} m",
+                Fault("/prior/sd_m", f"must be at least {LEAST_PRIOR_SD_M:g}"),
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +90,9 @@ class _PlaneCosts:
         order = telling_order(window, plane)
         self.plane, self.demeaned, self.headings = plane, demeaned, len(headings_rad)
         self.top = _DEMEANED_TOP_LEVEL if demeaned else TOP_LEVEL
+        self.compared: int = window.features_uT.size  # values per pose
+        while self.top < TOP_LEVEL and self.work(self.top, len(self.top_blocks())) > _TOP_SHARE * BUDGET:
+            self.top += 1
         self.z = np.ascontiguousarray(turned.features_uT[:, order])
         self.row = np.ascontiguousarray(turned.offset_cells[:, order, 0])
         self.column = np.ascontiguousarray(turned.offset_cells[:, order, 1])
@@ -110,6 +129,10 @@ class _PlaneCosts:
         )  # fmt: skip
         return bounds + self.constant
 
+    def work(self, level: int, count: int) -> int:
+        """What so many poses (level 0) or blocks cost of the budget, at most."""
+        return count * self.compared * (_DEMEANED_BOUND_WORK if self.demeaned and level else 1)
+
     def top_blocks(self) -> Blocks:
         ny, nx = self.plane.shape
         side = 1 << self.top
@@ -140,12 +163,17 @@ def search(
     temper: float = 1.0,
     demeaned: bool = False,
     capacity: int = CAPACITY,
+    budget: int = BUDGET,
 ) -> Candidates:
-    """Every pose of the planes within `window_nats` of the best, tempered by `temper` for the missed mass only."""
+    """Every pose of the planes within `window_nats` of the best, tempered by `temper` for the missed mass only.
+
+    At most `capacity` poses are kept, and `budget` values compared on each plane; what that leaves out is counted in
+    `missed_mass`, and `complete` says so.
+    """
     costs = [_PlaneCosts(plane, window, headings_rad, prior, temper, demeaned) for plane in planes]
     expected = max(on_plane.expected for on_plane in costs) + 2.0 * (window_nats + temper * _SPARE_NATS)
     starts = [_start(on_plane, expected) for on_plane in costs]
-    sweep = _Sweep(min(start.seed_cost for start in starts), 2.0 * window_nats, temper, capacity // len(planes))
+    sweep = _Sweep(min(start.seed_cost for start in starts), 2.0 * window_nats, temper, capacity // len(planes), budget)
     found = [sweep.run(on_plane, start) for on_plane, start in zip(costs, starts, strict=True)]
     plane = np.concatenate([np.full(len(poses), k) for k, (poses, _) in enumerate(found)])
     poses = np.concatenate([poses for poses, _ in found]).astype(np.int64)
@@ -170,8 +198,9 @@ def search(
 class _Sweep:
     """Level by level over one plane after the other; the incumbent and the window carry over."""
 
-    def __init__(self, best: float, window: float, temper: float, capacity: int) -> None:
+    def __init__(self, best: float, window: float, temper: float, capacity: int, budget: int) -> None:
         self.best, self.window, self.temper, self.capacity = best, window, temper, max(capacity, 1)
+        self.budget = budget
         self.missed_mass = 0.0  # at most, relative to the best pose
 
     def run(self, on_plane: _PlaneCosts, start: "_Start") -> tuple[Blocks, Array]:
@@ -180,6 +209,7 @@ class _Sweep:
         if self._stop() > start.followed_to:
             again = bounds <= self._stop()
             bounds[again] = on_plane.bounds(blocks[again], on_plane.top, self._stop())
+        left = self.budget - on_plane.work(on_plane.top, len(blocks))
         for level in range(on_plane.top, 0, -1):
             if level < on_plane.top:
                 bounds = on_plane.bounds(blocks, level, self._stop())
@@ -187,9 +217,11 @@ class _Sweep:
                 pose, cost = _dive(on_plane, blocks, bounds, level)
                 seed, seed_cost = (pose, cost) if cost < seed_cost else (seed, seed_cost)
                 self._improve(cost)
-            keep = self._keep(bounds, _BLOCKS_PER_POSE * self.capacity)
+            affordable = left // (level * on_plane.work(level - 1, 4))  # an even share for every level still to come
+            keep = self._keep(bounds, max(min(_BLOCKS_PER_POSE * self.capacity, affordable), 1))
             self.miss(on_plane, blocks, bounds, ~keep, level)
             blocks = on_plane.split(blocks[keep], level)
+            left -= on_plane.work(level - 1, len(blocks))
         seeded = np.flatnonzero((blocks == seed).all(axis=1))
         blocks = np.concatenate([seed, np.delete(blocks, seeded, axis=0)])
         costs = on_plane.costs(blocks, self._stop())

@@ -19,7 +19,8 @@ from app.positioning.techniques import (
 
 __all__ = ["conclude"]
 
-_CERTAIN = 0.8  # a fix has one mode with at least this probability
+_CERTAIN = 0.8  # a fix has one mode with at least this probability, off the map and what was missed counted in
+_MISSED = 0.05  # beyond this share of missed mass a radius of 95 % cannot be stated from the rest
 Position = tuple[float, float, float]
 
 
@@ -100,11 +101,17 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
     centre = _mode_mean(points, mass, peak)
     r68, r95 = mass_radius(points, mass, centre, (0.68, 0.95))
     off = points - centre
+    covariance = np.asarray((mass * off.T) @ off / mass.sum())
+    if (
+        belief.unmapped > 0.5 or _unweighed(matched, belief) > _MISSED
+    ):  # what was weighed says little of where the window may be
+        r68 = r95 = _searched_radius_m(matched, strongest, centre)
+        covariance = _searched_covariance_m2(matched, strongest, centre)
     return Posterior(
         floor_probability={floor_id: float(p) for floor_id, p in zip(ids, probability, strict=True)},
         floor_id=ids[strongest],
         position_m=_position(matched, plane, centre),
-        covariance_m2=np.asarray((mass * off.T) @ off / mass.sum()),
+        covariance_m2=covariance,
         radius_68_m=r68,
         radius_95_m=r95,
         modes=tuple(
@@ -120,19 +127,21 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
 
 
 def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[Status, str | None]:
-    if belief.missed > 0.5 and not matched.candidates.complete:
-        return "ambiguous", (
-            "the window matches so many places that not all of them were weighed; walk further, or send a prior "
-            "position or heading"
-        )
     scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if matched.demeaned else 0)
     distance2 = belief.best.distance2 / matched.gate_temper
     limit = chi_square_limit(scalars / matched.gate_temper, options.gate_probability)
     unlike_any_field = belief.off_map_distance2 > chi_square_limit(belief.off_map_scalars, options.gate_probability)
     if belief.unmapped > 0.5 and not (unlike_any_field and distance2 > limit):
+        weighed = "not all of the map was weighed, but " if _unweighed(matched, belief) > 0.5 else ""
         return "unmapped", (
-            f"the window fits ground without a map at least as well (probability {belief.unmapped:.2f}); walk on into "
-            "mapped corridors, or survey where this was recorded"
+            f"{weighed}the window fits ground without a map at least as well (probability {belief.unmapped:.2f}); walk "
+            "on into mapped corridors, or survey where this was recorded; if it was recorded on mapped ground, "
+            "calibrate the magnetometer or use composition demeaned"
+        )
+    if _unweighed(matched, belief) > 0.5:
+        return "ambiguous", (
+            "the window matches so many places that not all of them were weighed; walk further, or send a prior "
+            "position or heading"
         )
     if distance2 > limit:
         return "inconsistent", (
@@ -140,13 +149,42 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
             "units, frame and calibration, or whether the building changed since the survey; composition demeaned "
             "removes an offset"
         )
-    strongest = belief.modes[0].probability
+    strongest = belief.modes[0].probability * (1.0 - belief.unmapped) * (1.0 - _unweighed(matched, belief))
     if strongest < _CERTAIN:
         return "ambiguous", (
             f"the strongest place holds only {strongest:.2f} of the probability; walk further, turn a corner, or send "
             "a prior position or heading"
         )
     return "fix", None
+
+
+def _unweighed(matched: Matched, belief: Belief) -> float:
+    """The share of the mass that may have been missed because too many poses qualified; a bound, and often a loose one.
+
+    A complete search left out only poses far below the best: their bound is no evidence that they matter.
+    """
+    return 0.0 if matched.candidates.complete else belief.missed
+
+
+def _searched_box_m(matched: Matched, floor: int) -> tuple[Array, Array]:
+    """Lowest and highest corner (2,) of what was searched on a floor."""
+    planes = [plane for plane, on in zip(matched.planes, matched.plane_floor, strict=True) if on == floor]
+    low = np.array([plane.origin_m for plane in planes])
+    cells = np.array([plane.shape[::-1] for plane in planes])
+    extent = np.array([plane.resolution_m for plane in planes])[:, None] * (cells - 1)
+    return low.min(axis=0), (low + extent).max(axis=0)
+
+
+def _searched_radius_m(matched: Matched, floor: int, centre_m: Array) -> float:
+    low, high = _searched_box_m(matched, floor)
+    return float(np.linalg.norm(np.maximum(centre_m - low, high - centre_m)))
+
+
+def _searched_covariance_m2(matched: Matched, floor: int, centre_m: Array) -> Array:
+    """Second moment (2, 2) about `centre_m` of a uniform density over what was searched."""
+    low, high = _searched_box_m(matched, floor)
+    mean = 0.5 * (low + high) - centre_m
+    return np.asarray(np.diag(np.square(high - low) / 12.0) + np.outer(mean, mean))
 
 
 def _mode_mean(points_m: Array, mass: Array, peak_m: Array) -> Array:

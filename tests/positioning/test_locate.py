@@ -201,7 +201,10 @@ def test_demeaned_forgives_an_offset_that_raw_does_not(
 ) -> None:
     walked = walk_on(rng, world, length_m=8.0, samples=24, offset_uT=10.0)
     floors = [prepare_floor("a", world)]
-    assert locate(walked.window, floors).status == "inconsistent"
+    raw = locate(walked.window, floors)
+    assert raw.status in ("inconsistent", "unmapped")  # other ground may lie ten microtesla off
+    assert raw.reason is not None
+    assert "demeaned" in raw.reason
     demeaned = locate(walked.window, floors, composition="demeaned")
     assert demeaned.status == "fix", demeaned.reason
     assert error_m(demeaned, walked.position_m) < 0.5

@@ -179,3 +179,21 @@ def test_pyramid_bounds_enclose_every_square(ny: int, nx: int) -> None:
                 for c in range(2):
                     assert tree.ladder_uT2[c, codes[at][c]] <= least[c]
                     assert tree.ladder_uT2[c, codes[at][2 + c]] >= most[c]
+
+
+@pytest.mark.parametrize("demeaned", [False, True])
+def test_a_spent_budget_leaves_a_valid_bound(demeaned: bool, grid_of: Callable, walk_on: Callable) -> None:
+    """However little work is allowed: the mass left out stays bounded, and the answer does not claim completeness."""
+    rng = np.random.default_rng(7)
+    planes = prepare_floor("a", grid_of(rng, (40, 40), field_sd_uT=1.0)).planes
+    walked = walk_on(rng, grid_of(rng, (40, 40)), samples=10)
+    window, headings = reduce_window(walked.window, "vector", 0.25), heading_lattice(walked.window, 0.2)
+    prior = PosePrior(None, FLAT, np.zeros(len(headings)))
+    everything = exhaustive_scores(planes[0], window, headings, prior, 4.0, demeaned)
+    for budget in (1, 100_000):
+        found = search(planes, window, headings, prior, window_nats=200.0, temper=4.0, demeaned=demeaned, budget=budget)
+        assert not found.complete
+        assert len(found.score) * len(window) * 3 <= max(budget, 1000)
+        best = found.score[0]
+        left_out = np.exp((everything - best) / 4.0).sum() - np.exp((found.score - best) / 4.0).sum()
+        assert left_out <= found.missed_mass * (1 + 1e-6) + 1e-6
