@@ -64,7 +64,7 @@ def off_map(matched: Matched) -> OffMap:
     residual = turn_window(window, matched.headings_rad, plane.resolution_m).features_uT - plane.ambient_uT
     prior = process_prior(plane, variance)
     fit = process_evidence(residual, window.from_last_m, temper * noise, prior, matched.demeaned)
-    relative = np.exp(np.clip(fit.log_l - _best_pose_log_evidence(matched), -700, 700))
+    relative = np.exp(np.clip(fit.log_l - _best_pose_log_evidence(matched), -600, 600))
     heading = np.exp(matched.pose_prior.heading_log)
     odds = OFF_MAP_PRIOR / (1.0 - OFF_MAP_PRIOR)
     gated = process_evidence(residual, window.from_last_m, matched.gate_temper * noise, prior, matched.demeaned)
