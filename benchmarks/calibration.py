@@ -3,15 +3,20 @@
 A synthetic building of known field, surveyed in lanes one metre apart both ways on every floor by a sensor with noise,
 residual hard iron, attitude error and position error; then windows of 3, 5, 10 and 20 m on unseen random walks, in the
 level frame with unknown heading, by another sensor with errors of its own. Every floor is a candidate; a window whose
-strongest floor is wrong counts as missed.
+strongest floor is wrong counts as missed. Then what should not be a fix: windows walked through another building, and
+windows by a phone that was not calibrated.
 
-    python benchmarks/calibration.py --windows 500        exits non-zero unless the 95 % radius holds 92-98 %
+    python benchmarks/calibration.py --windows 500        exits non-zero unless the 95 % radius holds 92-98 %, and
+                                                          windows from another building are fixes in at most 5 %
 """
 
 import argparse
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from time import process_time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +25,7 @@ from app.field.grid import FieldGrid
 from app.field.spec import MapSpec
 from app.positioning.floors import SearchableFloor
 from app.positioning.locate import locate, prepare_floors
+from app.positioning.window import Composition, WindowFrame
 from app.synthetic.building import SyntheticBuilding, make_building
 from app.synthetic.sensors import Magnetometer, survey, window
 from app.synthetic.walks import lawn_mower, random_waypoints
@@ -37,10 +43,27 @@ ASKER = Magnetometer(
 HARD_IRON_UT = 0.3  # sd per axis of what calibration left, new for every survey and window
 LENGTHS_M = (3.0, 5.0, 10.0, 20.0)
 SPACING_M = 0.5
+FOREIGN_FIXES = 0.05  # at most this share of windows from another building may be called a fix
+BIASES_UT = (1.5, 3.0, 5.0)  # sd per axis of the hard iron of a phone that was not calibrated
 
 
-def with_hard_iron(sensor: Magnetometer, rng: np.random.Generator) -> Magnetometer:
-    x, y, z = rng.normal(0.0, HARD_IRON_UT, 3)
+class Asked(NamedTuple):
+    """A kind of window: frame, length, and how it is compared."""
+
+    frame: WindowFrame
+    length_m: float
+    composition: Composition
+
+
+FOREIGN = (
+    Asked("level", 3.0, "raw"), Asked("level", 5.0, "raw"),
+    Asked("level", 10.0, "demeaned"), Asked("norm", 10.0, "raw"),
+)  # fmt: skip
+BIASED = (Asked("level", 5.0, "raw"), Asked("level", 10.0, "raw"))
+
+
+def with_hard_iron(sensor: Magnetometer, rng: np.random.Generator, sd_uT: float = HARD_IRON_UT) -> Magnetometer:
+    x, y, z = rng.normal(0.0, sd_uT, 3)
     return replace(sensor, hard_iron_uT=(float(x), float(y), float(z)))
 
 
@@ -100,9 +123,55 @@ def report(rows: np.ndarray) -> int:
     return 0 if passed else 1
 
 
+def fixes_of(
+    name: str,
+    asked: Asked,
+    building: SyntheticBuilding,
+    floors: Sequence[SearchableFloor],
+    count: int,
+    rng: np.random.Generator,
+    bias_uT: float = HARD_IRON_UT,
+) -> float:
+    """Locate windows of one kind on the lowest floor, print their statuses, and return the share called a fix."""
+    statuses: Counter[str] = Counter()
+    right = 0
+    for _ in range(count):
+        walk = random_waypoints(building, 0, rng, length_m=20.0)
+        sensor = with_hard_iron(ASKER, rng, bias_uT)
+        samples = int(asked.length_m / SPACING_M) + 1
+        walked, pose = window(building, walk, sensor, rng, length_m=asked.length_m, samples=samples, frame=asked.frame)
+        fix = locate(walked, floors, composition=asked.composition)
+        statuses[fix.status] += 1
+        if fix.status == "fix" and fix.posterior is not None and fix.posterior.floor_id == "0":
+            error = np.linalg.norm(np.array(fix.posterior.position_m[:2]) - pose.position_m[:2])
+            right += int(error <= fix.posterior.radius_95_m)
+    columns = "".join(f"{statuses[status]:11d}" for status in ("fix", "unmapped", "inconsistent", "ambiguous"))
+    print(f"{name:18s} {asked.frame:6s} {asked.length_m:4.0f} m  {asked.composition:9s}{columns}{right:14d}")
+    return statuses["fix"] / count
+
+
+def report_unlikely(
+    building: SyntheticBuilding, floors: Sequence[SearchableFloor], count: int, rng: np.random.Generator
+) -> int:
+    """Windows from another building, which must not be fixes, and by phones that were not calibrated."""
+    print("                                                   fix   unmapped inconsistent ambiguous  fix within 95 %")
+    other = make_building(rng, width_m=30.0, depth_m=20.0, floors=1)
+    shares = [fixes_of("another building", asked, other, floors, count, rng) for asked in FOREIGN]
+    for bias in BIASES_UT:
+        for asked in BIASED:
+            fixes_of(f"hard iron {bias:.1f} uT", asked, building, floors, count, rng, bias)
+    passed = max(shares) <= FOREIGN_FIXES
+    print(
+        f"windows from another building are fixes in {100 * max(shares):.1f} % of the worst row "
+        f"(target {100 * FOREIGN_FIXES:.0f} at most)  {'PASS' if passed else 'FAIL'}"
+    )
+    return 0 if passed else 1
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--windows", type=int, default=500)
+    parser.add_argument("--unlikely", type=int, default=40, help="windows of each kind that should not be a fix")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--floors", type=int, default=2)
     given = parser.parse_args()
@@ -115,7 +184,8 @@ def main() -> int:
             f"floor {k}: noise {noise} uT, map sd {sd:.2f} uT, errors correlate over {grid.error_correlation_m:.2f} m"
         )
     floors = prepare_floors({str(k): grid for k, grid in enumerate(grids)})
-    return report(located(building, floors, given.windows, rng))
+    failed = report(located(building, floors, given.windows, rng))
+    return report_unlikely(building, floors, given.unlikely, rng) | failed
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from app.positioning.matching import Matched
 
 __all__ = ["Evidence", "OffMap", "ProcessPrior", "off_map", "process_evidence", "process_prior"]
 
-OFF_MAP_PRIOR = 0.25  # how likely, before the window is looked at, it was walked where nothing is mapped
+OFF_MAP_PRIOR = 0.4  # how likely, before the window is looked at, it was walked where nothing is mapped
 _MOST_CELLS = 40_000  # enough of a map to know how steep it is
 
 
