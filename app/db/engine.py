@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from app.errors import InvalidInput
 
-__all__ = ["create_database_engine", "downgrade", "migrate", "migration_state", "session_factory"]
+__all__ = ["create_database_engine", "downgrade", "migrate", "migration_state", "session_factory", "teach_old_sqlite"]
 
 BUSY_TIMEOUT_S = 30.0
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
@@ -113,15 +113,19 @@ def _unixepoch(modifier: str) -> float | None:
     return milliseconds / 1000
 
 
-def _teach_old_sqlite(connection: object, _record: object) -> None:
+def teach_old_sqlite() -> None:
+    """Give SQLite before 3.42 the clock that the job engine asks it for, in every engine of this process.
+
+    The job engine goes by Python's version, not SQLite's: on Python 3.12 with an older SQLite (Debian 12) its
+    timestamps would be NULL. It makes engines of its own, hence all of them.
+    """
+    if sqlite3.sqlite_version_info < (3, 42) and not event.contains(Engine, "connect", _add_unixepoch):
+        event.listen(Engine, "connect", _add_unixepoch)
+
+
+def _add_unixepoch(connection: object, _record: object) -> None:
     if isinstance(connection, sqlite3.Connection):
         connection.create_function("unixepoch", 1, _unixepoch)
-
-
-if sqlite3.sqlite_version_info < (3, 42):
-    # The job engine goes by Python's version, not SQLite's: on Python 3.12 with an older SQLite (Debian 12) its
-    # timestamps would be NULL. Every engine of the process, because it makes its own.
-    event.listen(Engine, "connect", _teach_old_sqlite)
 
 
 def _prepare_sqlite_connection(connection: sqlite3.Connection, _record: object) -> None:
@@ -192,4 +196,5 @@ def _run_alembic(engine: Engine, verb: str, revision: str) -> None:
 def _migrate_job_engine(url: URL) -> None:
     from dbos import DBOS
 
+    teach_old_sqlite()
     DBOS.migrate(url.render_as_string(hide_password=False))

@@ -21,7 +21,9 @@ from app.geometry import Array
 
 __all__ = ["learn_hyperparameters"]
 
-LEARNING_TILES = 6
+LEARNING_TILES = (6, 10)
+"""At least and at most; in between, one in `TILES_PER_LEARNING_TILE` of the tiles walked."""
+TILES_PER_LEARNING_TILE = 12
 LEARNING_FUNCTIONS = 15
 ROUNDS = 6
 LEARNABLE = (8.0, 1.0)
@@ -133,6 +135,7 @@ def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) ->
 def _well_walked(counts: Mapping[Tile, int]) -> list[Tile]:
     """Of the tiles in the upper half by number of observations, a few spread evenly over the lattice."""
     by_count = sorted(counts, key=lambda tile: (-counts[tile], tile))
-    upper = sorted(by_count[: max(LEARNING_TILES, len(by_count) // 2)])
-    picks = np.unique(np.linspace(0, len(upper) - 1, LEARNING_TILES).round().astype(int))
+    wanted = int(np.clip(len(counts) // TILES_PER_LEARNING_TILE, *LEARNING_TILES))
+    upper = sorted(by_count[: max(wanted, len(by_count) // 2)])
+    picks = np.unique(np.linspace(0, len(upper) - 1, wanted).round().astype(int))
     return [upper[pick] for pick in picks]

@@ -9,6 +9,8 @@ from dbos import DBOSClient, DBOSConfig, DBOSPortableJSONSerializer
 from sqlalchemy import Engine
 from sqlalchemy.engine import URL
 
+from app.db.engine import teach_old_sqlite
+
 __all__ = ["APPLICATION", "APPLICATION_VERSION", "BUILD", "QUEUE", "REBUILD", "engine_configuration", "open_client"]
 
 APPLICATION = "isodyn"
@@ -22,6 +24,7 @@ logging.getLogger("dbos").setLevel(logging.WARNING)
 
 def open_client(engine: Engine) -> DBOSClient:
     """A client that enqueues on `engine`'s connections; a lost database raises instead of blocking the caller."""
+    teach_old_sqlite()
     return DBOSClient(
         system_database_engine=engine,
         serializer=DBOSPortableJSONSerializer(),  # the default is pickle
@@ -33,6 +36,7 @@ def open_client(engine: Engine) -> DBOSClient:
 
 def engine_configuration(url: URL, executor_id: str) -> DBOSConfig:
     """The engine's configuration in a worker or a janitor."""
+    teach_old_sqlite()
     return DBOSConfig(
         name=APPLICATION,
         system_database_url=url.render_as_string(hide_password=False),

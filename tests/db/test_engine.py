@@ -13,7 +13,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import Connection, Engine, inspect, select, text
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.db.engine import create_database_engine, downgrade, migrate
+from app.db.engine import create_database_engine, downgrade, migrate, teach_old_sqlite
 from app.db.tables import Base, Organisation
 from app.errors import InvalidInput
 
@@ -115,6 +115,7 @@ def test_addresses_that_are_not_offered_say_so(url: str) -> None:
 
 def test_sqlite_knows_the_time_to_the_millisecond_whatever_its_version(sqlite_url: str) -> None:
     """Python 3.12 and newer may come with an SQLite that does not; the job engine stores such times as integers."""
+    teach_old_sqlite()
     engine = create_database_engine(sqlite_url)
     with engine.connect() as connection:
         for _ in range(200):
