@@ -7,6 +7,7 @@ from threading import Thread
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
+from threadpoolctl import threadpool_limits
 
 from app import __version__
 from app.api import buildings, health, jobs, locate, maps, surveys
@@ -63,6 +64,7 @@ def open_context(settings: Settings) -> Context:
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The application. `first_start` must have run on these settings."""
     settings = settings or Settings()
+    threadpool_limits(1)  # a query's matrices are small: more BLAS threads make it slower, and starve the others
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

@@ -16,6 +16,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 from sqlalchemy import select
+from threadpoolctl import threadpool_limits
 
 from app.db.engine import create_database_engine, session_factory
 from app.db.tables import Organisation
@@ -134,4 +135,5 @@ def timed(call: object) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with threadpool_limits(1):  # as the server does
+        sys.exit(main())

@@ -1,6 +1,6 @@
 """Keys in `Authorization: Bearer isd_...`, and the scopes an endpoint asks for."""
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Depends
@@ -27,8 +27,8 @@ def _identity(
     return identity
 
 
-def _needs(*any_of: str) -> Callable[[Identity], Identity]:
-    def check(identity: Annotated[Identity, Depends(_identity)]) -> Identity:
+def _needs(*any_of: str) -> Callable[[Identity], Awaitable[Identity]]:
+    async def check(identity: Annotated[Identity, Depends(_identity)]) -> Identity:
         if not identity.may(*any_of):
             raise Forbidden(f"this needs a key with scope {' or '.join(any_of)}")
         return identity

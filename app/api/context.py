@@ -37,8 +37,8 @@ class Context:
             yield session
 
 
-def context_of(request: Request) -> Context:
-    """The context of the application that serves this request."""
+async def context_of(request: Request) -> Context:
+    """The context of the application that serves this request. Async, so that it costs no change of threads."""
     context: Context = request.app.state.context
     return context
 
