@@ -20,7 +20,7 @@ from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
 from app.positioning.locate import warm_up
 from app.services.grid_cache import GridCache
-from app.services.manage_keys import Identity, ensure_admin_key, recognise_key
+from app.services.manage_keys import KeyRing, ensure_admin_key
 from app.settings import Settings
 from app.viewer.database_source import DatabaseViewerSource
 from app.viewer.page import ViewerApp
@@ -50,14 +50,16 @@ def open_context(settings: Settings) -> Context:
     """Open the database, the blob store and the job queue of a web process."""
     engine = create_database_engine(settings.resolved_database_url)
     blobs = open_blob_store(settings.resolved_blob_url)
+    sessions = session_factory(engine)
     return Context(
         settings=settings,
         engine=engine,
-        sessions=session_factory(engine),
+        sessions=sessions,
         blobs=blobs,
         queue=JobQueue(engine),
         grids=GridCache(blobs, settings.grid_cache_bytes),
         metrics=Metrics(),
+        keys=KeyRing(sessions),
     )
 
 
@@ -75,12 +77,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         context.engine.dispose()
 
     context = open_context(settings)
-
-    def authenticate(key: str) -> Identity | None:
-        with context.sessions() as session:
-            return recognise_key(session, key)
-
-    viewer = ViewerApp(authenticate, DatabaseViewerSource(context.sessions, context.blobs))
+    viewer = ViewerApp(context.keys.recognise, DatabaseViewerSource(context.sessions, context.blobs))
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context

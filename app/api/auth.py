@@ -4,24 +4,25 @@ from collections.abc import Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Depends
+from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from app.api.context import ContextDep
 from app.api.problems import Forbidden, Unauthorised
-from app.services.manage_keys import Identity, recognise_key
+from app.services.manage_keys import Identity
 
 __all__ = ["AdminOnly", "Identity", "Locating", "Reading", "SurveyReading", "SurveyWriting", "MapWriting"]
 
 _bearer = HTTPBearer(auto_error=False, description="an API key, `isd_...`; `isodyn keys create` makes one")
 
 
-def _identity(
+async def _identity(
     context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Identity:
     if credentials is None:
         raise Unauthorised("send your key as `Authorization: Bearer isd_...`")
-    with context.sessions() as session:
-        identity = recognise_key(session, credentials.credentials)
+    secret = credentials.credentials
+    identity = context.keys.recent(secret) or await run_in_threadpool(context.keys.recognise, secret)
     if identity is None:
         raise Unauthorised("this key is not known or was revoked; `isodyn keys create` makes a new one")
     return identity

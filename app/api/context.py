@@ -13,6 +13,7 @@ from app.api.metrics import Metrics
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
 from app.services.grid_cache import GridCache
+from app.services.manage_keys import KeyRing
 from app.settings import Settings
 
 __all__ = ["Context", "ContextDep", "context_of"]
@@ -29,6 +30,7 @@ class Context:
     queue: JobQueue
     grids: GridCache
     metrics: Metrics
+    keys: KeyRing
 
     @contextmanager
     def transaction(self) -> Iterator[Session]:

@@ -5,17 +5,20 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
+from time import monotonic
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Key, Organisation
 from app.errors import InvalidInput, NotFound
 
-__all__ = ["SCOPES", "Identity", "create_key", "ensure_admin_key", "recognise_key", "revoke_key"]
+__all__ = ["SCOPES", "Identity", "KeyRing", "create_key", "ensure_admin_key", "recognise_key", "revoke_key"]
 
 SCOPES = ("admin", "survey:write", "map:read", "map:write", "locate")
 KEY_PREFIX = "isd_"
+RECENT_S = 2.0  # a revoked key may still be taken for this long
+MOST_RECENT = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,29 @@ def recognise_key(session: Session, secret: str) -> Identity | None:
         select(Key.organisation_id, Key.scopes, Key.id).where(Key.sha256 == _digest(secret), Key.revoked_at.is_(None))
     ).one_or_none()
     return None if row is None else Identity(row.organisation_id, frozenset(row.scopes), row.id)
+
+
+class KeyRing:
+    """Recognises keys and remembers those of the last seconds: a busy client costs one look-up in `RECENT_S`."""
+
+    def __init__(self, sessions: sessionmaker[Session]) -> None:
+        self._sessions = sessions
+        self._recent: dict[str, tuple[float, Identity]] = {}
+
+    def recent(self, secret: str) -> Identity | None:
+        """Whose key this is if it was recognised a moment ago; asks nobody."""
+        until, identity = self._recent.get(_digest(secret), (0.0, None))
+        return identity if monotonic() < until else None
+
+    def recognise(self, secret: str) -> Identity | None:
+        """Whose key this is, by the database."""
+        with self._sessions() as session:
+            identity = recognise_key(session, secret)
+        if identity is not None:
+            if len(self._recent) >= MOST_RECENT:
+                self._recent.clear()
+            self._recent[_digest(secret)] = (monotonic() + RECENT_S, identity)
+        return identity
 
 
 def revoke_key(session: Session, key_id: str) -> None:
