@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-__all__ = ["Finite", "Id", "Links", "Metres", "Name", "Point", "RequestModel"]
+__all__ = ["Finite", "Id", "Metres", "Name", "Point", "RequestModel"]
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
@@ -18,9 +18,3 @@ class RequestModel(BaseModel):
     """A request body: unknown names are refused, so that a misspelt option is never silently ignored."""
 
     model_config = ConfigDict(extra="forbid")
-
-
-class Links(BaseModel):
-    """Where the rest of a list is; `next` is left out on the last page."""
-
-    next: str | None = None

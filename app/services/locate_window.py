@@ -38,8 +38,8 @@ class LocateResult:
 def active_maps(
     session: Session, organisation_id: str, *, building_id: str | None = None, floor_ids: Sequence[str] | None = None
 ) -> list[ActiveMap]:
-    """The active maps of a building's floors, or of the floors named. Raises NotFound for a floor (or a building
-    without floors) that does not exist here; a floor without a map is simply not among them."""
+    """The active maps of a building's floors, or of the floors named. Raises NotFound for a named floor that does
+    not exist here; a floor without a map is simply not among them."""
     statement = (
         select(Floor.id, Map.id, Map.grid_sha256)
         .join(Map, Map.id == Floor.active_map_id, isouter=True)
