@@ -134,7 +134,9 @@ class Survey(Base):
 
 
 class Map(Base):
-    """`status`: accepted, running, ready, failed, dismissed. `spec` is the request; the grid is a blob."""
+    """`status`: accepted, running, ready, failed, dismissed. `spec` is the request; grid, layers and quality are blobs.
+
+    `state_sha256` is a cache: what the next build may start from instead of every sample."""
 
     __tablename__ = "map"
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
@@ -147,7 +149,9 @@ class Map(Base):
     survey_ids: Mapped[list[str]]
     components: Mapped[str | None] = mapped_column(String(20))
     grid_sha256: Mapped[str | None] = mapped_column(Sha256)
+    layers_sha256: Mapped[str | None] = mapped_column(Sha256)
     quality_sha256: Mapped[str | None] = mapped_column(Sha256)
+    state_sha256: Mapped[str | None] = mapped_column(Sha256)
     bounds_m: Mapped[list[float] | None]
     hyperparameters: Mapped[dict[str, Any] | None]
     score: Mapped[dict[str, Any] | None]

@@ -6,6 +6,7 @@ from typing import Literal
 
 from app.field.grid import FieldGrid
 from app.field.samples import Components
+from app.geometry import Array
 
 __all__ = [
     "ComponentConsistency",
@@ -88,10 +89,14 @@ class ConsistencyReport:
 
 @dataclass(frozen=True, slots=True)
 class FittedMap:
-    """What a fit gives back. `hyperparameters` is plain JSON: kernel, lengths and sds with units in their names."""
+    """What a fit gives back. `hyperparameters` is plain JSON: kernel, lengths and sds with units in their names.
+
+    `layers`: further layers of the grid by name ("coverage", "conflict"), (nz, ny, nx), NaN where nothing is known.
+    """
 
     grid: FieldGrid
     hyperparameters: dict[str, object]
     score: Score | None
     score_reason: str | None  # why there is no score
     consistency: dict[str, ConsistencyReport] = field(default_factory=dict)  # by survey id
+    layers: dict[str, Array] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Grids and samples as bytes and back: safetensors, which maps plain arrays and cannot carry code.
+"""Grids, their layers, and samples as bytes and back: safetensors, which maps plain arrays and cannot carry code.
 
 The same values always give the same bytes, so a map's content hash is also the test that two fits agree.
 """
@@ -16,7 +16,14 @@ from app.errors import CorruptArtefact
 from app.field.grid import FieldGrid
 from app.field.samples import Samples
 
-__all__ = ["grid_from_bytes", "grid_to_bytes", "samples_from_bytes", "samples_to_bytes"]
+__all__ = [
+    "grid_from_bytes",
+    "grid_to_bytes",
+    "layers_from_bytes",
+    "layers_to_bytes",
+    "samples_from_bytes",
+    "samples_to_bytes",
+]
 
 
 def grid_to_bytes(grid: FieldGrid) -> bytes:
@@ -40,6 +47,17 @@ def grid_from_bytes(data: bytes) -> FieldGrid:
         error_correlation_m=header["error_correlation_m"],
         **arrays,
     )
+
+
+def layers_to_bytes(layers: Mapping[str, NDArray[Any]]) -> bytes:
+    """Further layers of a grid, (nz, ny, nx) each, as one immutable blob in single precision."""
+    return _save({"kind": "layers"}, {name: np.asarray(layer, np.float32) for name, layer in layers.items()})
+
+
+def layers_from_bytes(data: bytes) -> dict[str, NDArray[np.float32]]:
+    """The layers in a blob, by name. Raises CorruptArtefact."""
+    _, arrays = _load(data, "layers")
+    return dict(sorted(arrays.items()))
 
 
 def samples_to_bytes(samples: Samples) -> bytes:

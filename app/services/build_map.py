@@ -20,7 +20,7 @@ from app.errors import InvalidInput, NotFound
 from app.field.fit import fit_map
 from app.field.samples import SampleFrame, richest_components
 from app.field.spec import FittedMap, MapSpec
-from app.services.artefacts import grid_to_bytes, samples_from_bytes
+from app.services.artefacts import grid_to_bytes, layers_to_bytes, samples_from_bytes
 
 __all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "publish_build"]
 
@@ -63,7 +63,7 @@ def claim_build(session: Session, job_id: str) -> Plan:
 
 
 def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
-    """Fit the map of a plan and store its grid and quality reports as blobs. No database; may take minutes.
+    """Fit the map of a plan and store its grid, layers and quality reports as blobs. No database; may take minutes.
 
     Raises InvalidInput (nothing to fit, frames that cannot give the components asked for), JobCancelled (through
     `progress`).
@@ -81,6 +81,7 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
     progress(0.96, "storing the grid")
     return {
         "grid_sha256": blobs.put(grid_to_bytes(fitted.grid)),
+        "layers_sha256": blobs.put(layers_to_bytes(fitted.layers)) if fitted.layers else None,
         "quality_sha256": blobs.put(_quality_bytes(fitted)),
         "components": fitted.grid.components,
         "bounds_m": list(fitted.grid.bounds_m),
@@ -96,6 +97,8 @@ def publish_build(session: Session, job_id: str, plan: Plan, result: Result) -> 
     map_row = session.get_one(Map, plan["map_id"])
     for name in ("grid_sha256", "quality_sha256", "components", "bounds_m", "hyperparameters", "score", "score_reason"):
         setattr(map_row, name, result[name])
+    for name in ("layers_sha256", "state_sha256"):  # not every fit has them
+        setattr(map_row, name, result.get(name))
     map_row.status, map_row.finished_at = "ready", datetime.now(UTC)
     floor = session.get_one(Floor, plan["floor_id"], with_for_update=True)
     if map_row.activate and floor.active_sequence < plan["sequence"]:

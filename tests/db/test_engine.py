@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Engine, inspect, select, text
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.engine import create_database_engine, downgrade, migrate, teach_old_sqlite
-from app.db.tables import Base, Organisation
+from app.db.tables import Base, Map, Organisation
 from app.errors import InvalidInput
 
 ROOT = Path(__file__).parents[2]
@@ -49,6 +49,39 @@ def test_down_and_up_again(engine: Engine, database_url: str) -> None:
     migrate(engine)  # once more changes nothing
     with engine.connect() as connection:
         assert differences(connection) == []
+
+
+def test_a_map_made_before_layers_stays_when_the_schema_grows_and_shrinks(fresh_url: str) -> None:
+    def columns_of_map() -> set[str]:
+        return {column["name"] for column in inspect(engine).get_columns("map")}
+
+    migrate(fresh_url)
+    engine = create_database_engine(fresh_url)
+    downgrade(engine, "0001")
+    assert not columns_of_map() & {"layers_sha256", "state_sha256"}
+    rows = {  # the columns of that time, not those of today's classes
+        "organisation": {"id": "o", "name": "o"},
+        "building": {"id": "b", "organisation_id": "o", "name": "b"},
+        "floor": {"id": "f", "organisation_id": "o", "building_id": "b", "name": "f", "ordinal": 0, "elevation_m": 0.0,
+                  "auto_build": True, "claimed_generation": 0, "build_sequence": 1, "active_sequence": 1},
+        "map": {"id": "m", "organisation_id": "o", "floor_id": "f", "status": "ready", "sequence": 1, "activate": True,
+                "spec": "{}", "survey_ids": "[]", "grid_sha256": "0" * 64},
+    }  # fmt: skip
+    with engine.begin() as connection:
+        for table, row in rows.items():
+            names = [*row, "created_at"]
+            statement = f"INSERT INTO {table} ({', '.join(names)}) VALUES ({', '.join(f':{name}' for name in names)})"
+            connection.execute(text(statement), row | {"created_at": "2026-01-01 00:00:00"})
+    migrate(engine)
+    with Session(engine) as session:
+        row = session.get_one(Map, "m")
+        assert (row.grid_sha256, row.layers_sha256, row.state_sha256) == ("0" * 64, None, None)
+    downgrade(engine, "0001")
+    migrate(engine)
+    with engine.connect() as connection:
+        assert differences(connection) == []
+        assert connection.scalar(text("SELECT grid_sha256 FROM map")) == "0" * 64
+    engine.dispose()
 
 
 @pytest.fixture

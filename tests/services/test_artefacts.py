@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from app.errors import CorruptArtefact
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components, Samples
-from app.services.artefacts import grid_from_bytes, grid_to_bytes, samples_from_bytes, samples_to_bytes
+from app.services.artefacts import (
+    grid_from_bytes,
+    grid_to_bytes,
+    layers_from_bytes,
+    layers_to_bytes,
+    samples_from_bytes,
+    samples_to_bytes,
+)
 
 
 def make_grid(components: Components, seed: int = 0) -> FieldGrid:
@@ -43,6 +50,20 @@ def test_a_grid_comes_back_as_it_was(components: Components) -> None:
         np.testing.assert_array_equal(getattr(back, field.name), getattr(grid, field.name))
 
 
+def test_layers_come_back_as_they_were_whatever_their_order() -> None:
+    rng = np.random.default_rng(2)
+    layers = {name: rng.normal(size=(2, 5, 7)).astype(np.float32) for name in ("coverage", "conflict")}
+    layers["conflict"][0, :2] = np.nan
+    data = layers_to_bytes(layers)
+    assert data == layers_to_bytes(dict(reversed(layers.items())))
+    assert data == layers_to_bytes({name: layer.astype(np.float64) for name, layer in layers.items()})
+    back = layers_from_bytes(data)
+    assert list(back) == ["conflict", "coverage"]
+    for name, layer in layers.items():
+        assert back[name].dtype == np.float32
+        np.testing.assert_array_equal(back[name], layer)
+
+
 @pytest.mark.parametrize("frame", ["building", "level", "norm"])
 @pytest.mark.parametrize("full", [True, False])
 def test_samples_come_back_as_they_were(frame: str, full: bool) -> None:
@@ -69,6 +90,8 @@ def test_bytes_that_are_no_artefact_are_named_damaged(data: bytes) -> None:
 def test_one_kind_is_not_taken_for_another() -> None:
     with pytest.raises(CorruptArtefact, match="samples was expected"):
         samples_from_bytes(grid_to_bytes(make_grid("norm")))
+    with pytest.raises(CorruptArtefact, match="layers was expected"):
+        layers_from_bytes(grid_to_bytes(make_grid("norm")))
 
 
 def test_a_truncated_grid_is_damaged() -> None:
