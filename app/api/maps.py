@@ -51,12 +51,15 @@ class NewMap(RequestModel):
 
 
 class ScoreView(BaseModel):
-    """Leave-one-survey-out score; one value per component."""
+    """Leave-one-survey-out score; lists have one value per component."""
 
     rmse_ut: list[float]
     coverage_2sigma: list[float]
     nlpd: float
     held_out_samples: int
+    rmse_vec_ut: Annotated[float | None, Field(description="root of the summed squares of rmse_ut")] = None
+    rmse_of_norm_ut: Annotated[float | None, Field(description="of the magnitude, predicted against measured")] = None
+    sharpness_ut: Annotated[list[float], Field(description="mean predictive sd, noise included")] = []
 
 
 class MapView(BaseModel):

@@ -21,7 +21,7 @@ from app.api.models import Id, Name, RequestModel
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Floor, Map, Survey
 from app.errors import NotFound
-from app.field.spec import ComponentConsistency, SegmentConsistency
+from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency
 from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
 from app.services.receive_survey import parse_survey, record_survey
@@ -178,6 +178,9 @@ class ConsistencyView(BaseModel):
     components: list[ComponentConsistency]
     segments: list[SegmentConsistency]
     reason: str | None
+    change_point: Annotated[
+        ChangePoint | None, Field(description="where in the log errors changed; null when nowhere clearly")
+    ] = None
 
 
 @router.get("/surveys/{survey_id}/consistency", summary="How the survey fits the map of the others (Kuevor B14)")

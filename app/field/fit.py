@@ -43,7 +43,7 @@ def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _s
     progress(0.9, "scoring the map by leaving each survey out")
     held_out, noise_sd_uT = _held_out(observed, estimate, ambient_uT)
     correlation_m = error_correlation_m(held_out)
-    scored = score(held_out)
+    scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
     names = COMPONENT_NAMES[spec.components]
     return FittedMap(
         grid=_grid(observed, estimate, spec, ambient_uT, noise_sd_uT, correlation_m),

@@ -90,19 +90,28 @@ class HeldOutPrediction:
             self._variance_ratio[inside] += weight[start:stop] * (variance_ratio - 1.0)
 
 
-def score(held_out: Mapping[str, HeldOut]) -> Score | None:
-    """Over all judged samples of all surveys; None when no survey comes near another."""
-    judged = [h for h in held_out.values() if h.judged.any()]
+def score(held_out: Mapping[str, HeldOut], measured_uT: Mapping[str, Array]) -> Score | None:
+    """Over all judged samples of all surveys; None when no survey comes near another.
+
+    measured_uT: survey id -> (N, c) the samples' features, of which the norm is taken (Kuevor B12, B13).
+    """
+    judged = {name: h for name, h in held_out.items() if h.judged.any()}
     if not judged:
         return None
-    error_uT = np.concatenate([h.error_uT[h.judged] for h in judged])
-    standardised = np.concatenate([h.standardised for h in judged])
-    counts = np.array([np.count_nonzero(h.judged) for h in judged])
+    error_uT = np.concatenate([h.error_uT[h.judged] for h in judged.values()])
+    measured = np.concatenate([measured_uT[name][h.judged] for name, h in judged.items()])
+    standardised = np.concatenate([h.standardised for h in judged.values()])
+    counts = np.array([np.count_nonzero(h.judged) for h in judged.values()])
+    mean_square_uT2 = np.mean(np.square(error_uT), axis=0)
+    norm_error_uT = np.linalg.norm(measured, axis=1) - np.linalg.norm(measured - error_uT, axis=1)
     return Score(
-        rmse_ut=tuple(np.sqrt(np.mean(np.square(error_uT), axis=0)).tolist()),
+        rmse_ut=tuple(np.sqrt(mean_square_uT2).tolist()),
         coverage_2sigma=tuple(np.mean(np.abs(standardised) <= 2.0, axis=0).tolist()),
-        nlpd=float(counts @ [h.nlpd for h in judged] / counts.sum()),
+        nlpd=float(counts @ [h.nlpd for h in judged.values()] / counts.sum()),
         held_out_samples=len(error_uT),
+        rmse_vec_ut=float(np.sqrt(mean_square_uT2.sum())),
+        rmse_of_norm_ut=float(np.sqrt(np.mean(np.square(norm_error_uT)))),
+        sharpness_ut=tuple(np.concatenate([h.sd_uT[h.judged] for h in judged.values()]).mean(axis=0).tolist()),
     )
 
 

@@ -9,12 +9,15 @@ from app.field.samples import Components
 from app.geometry import Array
 
 __all__ = [
+    "ChangePoint",
+    "ComponentChange",
     "ComponentConsistency",
     "ConsistencyReport",
     "FittedMap",
     "Engine",
     "Kernel",
     "MapSpec",
+    "OutOfDateRegion",
     "Progress",
     "Score",
     "SegmentConsistency",
@@ -40,13 +43,19 @@ class MapSpec:
 class Score:
     """Leave-one-survey-out score: each survey predicted from all the others (predictive sd includes the noise).
 
-    rmse_ut, coverage_2sigma: one per component. nlpd: mean negative log predictive density per sample and component.
+    rmse_ut, coverage_2sigma, sharpness_ut: one per component; sharpness is the mean predictive sd, noise included.
+    nlpd: mean negative log predictive density per sample and component.
+    rmse_vec_ut: root of the summed squares of rmse_ut; rmse_of_norm_ut: of |predicted| against |measured|. The two are
+    not the same (Kuevor B13); None where a score was made without them.
     """
 
     rmse_ut: tuple[float, ...]
     coverage_2sigma: tuple[float, ...]
     nlpd: float
     held_out_samples: int
+    rmse_vec_ut: float | None = None
+    rmse_of_norm_ut: float | None = None
+    sharpness_ut: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +81,33 @@ class SegmentConsistency:
 
 
 @dataclass(frozen=True, slots=True)
+class ComponentChange:
+    """Errors of one component (measured minus predicted) before and after a change: their mean and sd, uT."""
+
+    component: str
+    mean_before_ut: float
+    mean_after_ut: float
+    sd_before_ut: float
+    sd_after_ut: float
+
+
+@dataclass(frozen=True, slots=True)
+class ChangePoint:
+    """Where in the log errors changed: from `sample` on, up to `until_sample` where they changed back (None: the end).
+
+    "Before" is all of the walk outside the changed stretch. p_value: of a change as clear anywhere in a steady walk,
+    with autocorrelation and the places looked at accounted for.
+    """
+
+    sample: int
+    path_m: float
+    until_sample: int | None
+    until_path_m: float | None
+    p_value: float
+    components: tuple[ComponentChange, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class ConsistencyReport:
     """The consistency of one survey with the map of *the other* surveys (Kuevor B14), whole and in segments.
 
@@ -85,6 +121,24 @@ class ConsistencyReport:
     components: tuple[ComponentConsistency, ...] = ()
     segments: tuple[SegmentConsistency, ...] = ()
     reason: str | None = None
+    change_point: ChangePoint | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OutOfDateRegion:
+    """Where recent surveys contradict older ones that agree among themselves: metal was moved, added or taken away.
+
+    bounds_m: (x_min, y_min, x_max, y_max). change_ut: recent minus older field per component, in the part of the region
+    where it is clearest; components: those whose change is proven. p_value: of one as clear anywhere on the map by
+    chance.
+    """
+
+    bounds_m: tuple[float, float, float, float]
+    components: tuple[str, ...]
+    change_ut: tuple[float, ...]
+    surveys_before: tuple[str, ...]
+    surveys_after: tuple[str, ...]
+    p_value: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,3 +154,4 @@ class FittedMap:
     score_reason: str | None  # why there is no score
     consistency: dict[str, ConsistencyReport] = field(default_factory=dict)  # by survey id
     layers: dict[str, Array] = field(default_factory=dict)
+    out_of_date: tuple[OutOfDateRegion, ...] = ()

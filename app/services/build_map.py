@@ -163,5 +163,6 @@ def _quality_bytes(fitted: FittedMap) -> bytes:
         "noise_sd_ut": [float(sd) for sd in fitted.grid.noise_sd_uT],
         "error_correlation_m": fitted.grid.error_correlation_m,
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
+        "out_of_date": [asdict(region) for region in fitted.out_of_date],
     }
     return json.dumps(quality, sort_keys=True, allow_nan=False).encode()

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from app.field.exact import estimate_by_exact
+from app.field.fit import fit_map
 from app.field.hilbert import posterior
 from app.field.hyperparameters import Hyperparameters
 from app.field.leave_one_out import HeldOut, HeldOutPrediction, error_correlation_m, score
@@ -65,16 +66,35 @@ def held_out(standardised, step_m=0.1):
 
 def test_score_of_calibrated_errors():
     errors = np.random.default_rng(0).normal(size=(20_000, 2))
-    scored = score({"a": held_out(errors[:5000]), "b": held_out(errors[5000:])})
+    halves = {"a": errors[:5000], "b": errors[5000:]}
+    scored = score({name: held_out(half) for name, half in halves.items()}, halves)
     assert scored.held_out_samples == 20_000
     assert scored.rmse_ut == pytest.approx((1.0, 1.0), abs=0.02)
     assert scored.coverage_2sigma == pytest.approx((0.9545, 0.9545), abs=0.005)
     assert scored.nlpd == pytest.approx(0.5 * np.log(2 * np.pi) + 0.5, abs=0.02)
 
 
+def test_the_score_of_the_vector_of_the_norm_and_sharpness_by_hand():
+    measured = np.array([[3.0, 4.0], [0.0, 5.0], [100.0, 100.0]])
+    predicted = np.array([[6.0, 8.0], [5.0, 0.0], [0.0, 0.0]])
+    judged = np.array([True, True, False])
+    h = HeldOut(measured - predicted, np.array([[1.0, 2.0], [3.0, 4.0], [9.0, 9.0]]), judged, np.arange(3.0))
+    scored = score({"a": h}, {"a": measured})
+    assert scored.rmse_ut == pytest.approx((np.sqrt((9 + 25) / 2), np.sqrt((16 + 25) / 2)))
+    assert scored.rmse_vec_ut == pytest.approx(np.hypot(*scored.rmse_ut))  # Kuevor (2.9)
+    assert scored.rmse_of_norm_ut == pytest.approx(np.sqrt((25 + 0) / 2))  # a turned vector has the right norm
+    assert scored.sharpness_ut == pytest.approx((2.0, 3.0))
+
+
+def test_the_norm_of_a_norm_map_is_itself(room):
+    fitted = fit_map(room.lanes(np.random.default_rng(1), surveys=2), MapSpec(components="norm", resolution_m=1.0))
+    assert fitted.score.rmse_of_norm_ut == pytest.approx(fitted.score.rmse_ut[0])
+    assert fitted.score.rmse_vec_ut == pytest.approx(fitted.score.rmse_ut[0])
+
+
 def test_nothing_judged_gives_no_score():
     one = held_out(np.zeros((10, 1)))
-    assert score({"a": HeldOut(one.error_uT, one.sd_uT, np.zeros(10, dtype=bool), one.path_m)}) is None
+    assert score({"a": HeldOut(one.error_uT, one.sd_uT, np.zeros(10, dtype=bool), one.path_m)}, {}) is None
 
 
 @pytest.mark.parametrize("length_m", [1.0, 3.0])
