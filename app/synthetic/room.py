@@ -59,7 +59,7 @@ class SyntheticRoom:
         """(n,) Frobenius norm of the Jacobian at points (n, 3), by central differences (Kuevor, eq. 4.5)."""
         steps = step_m * np.eye(3)
         slopes = [(self.field_uT(points_m + s) - self.field_uT(points_m - s)) / (2.0 * step_m) for s in steps]
-        return np.sqrt(np.sum(np.square(slopes), axis=(0, 2)))
+        return np.asarray(np.sqrt(np.sum(np.square(slopes), axis=(0, 2))))
 
 
 def make_room(rng: np.random.Generator) -> SyntheticRoom:
@@ -119,7 +119,7 @@ def _corners(altitudes_m: tuple[float, ...]) -> Array:
     """Ends of the lanes (k, 3), each altitude begun where the one below ended."""
     (x0, y0, _), (x1, y1, _) = TRAINING_BOX_M
     lanes = np.arange(y0, y1 + 1e-9, _LANE_M)
-    corners = []
+    corners: list[tuple[float, float, float]] = []
     for index, altitude in enumerate(altitudes_m):
         ordered = lanes if index % 2 == 0 else lanes[::-1]
         for lane in ordered:
