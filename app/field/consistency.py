@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, chdtrc
 
+from app.field.change_point import find_change
 from app.field.leave_one_out import HeldOut
 from app.field.noise_calibration import NOMINAL_COVERAGE
 from app.field.spec import ComponentConsistency, ConsistencyReport, SegmentConsistency
@@ -80,6 +81,7 @@ def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: 
         nlpd=held_out.nlpd,
         components=components,
         segments=segments,
+        change_point=find_change(held_out, names, correlation_m),
     )
 
 

@@ -31,6 +31,7 @@ def test_clean_surveys_are_consistent(walks):
     reports = fit_map(walks, SPEC).consistency
     assert {r.status for r in reports.values()} == {"consistent"}
     assert all(c.p_value > 1e-3 for r in reports.values() for c in r.components)
+    assert all(r.change_point is None for r in reports.values())
 
 
 def test_an_offset_from_the_middle_on_is_found_there(walks):
@@ -44,6 +45,8 @@ def test_an_offset_from_the_middle_on_is_found_there(walks):
     assert bad_segments(report)
     assert all(s.stop > middle for s in bad_segments(report))
     assert all(not s.consistent for s in report.segments if s.start >= middle)
+    assert report.change_point.sample == pytest.approx(middle, abs=20)
+    assert report.change_point.components[0].component == "bx"
     bx, by, _ = report.components
     assert bx.p_value < 0.05 < by.p_value
 
@@ -57,6 +60,8 @@ def test_a_stretch_turned_by_a_right_angle_is_found(walks):
     assert report.status == "inconsistent"
     assert all(not s.consistent for s in report.segments if s.stop <= third)
     assert all(s.start < third for s in bad_segments(report))
+    assert report.change_point.sample == pytest.approx(third, abs=20)
+    assert {c.component for c in report.change_point.components} >= {"bx", "by"}
 
 
 def test_a_survey_far_from_the_others_is_unjudged(make_room):
