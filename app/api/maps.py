@@ -2,13 +2,16 @@
 
 from datetime import datetime
 from hashlib import sha256 as sha256_of
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from fastapi import APIRouter, Query, Request, Response
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
+from app import __version__
 from app.api.auth import Identity, MapWriting, Reading
 from app.api.buildings import find_floor
 from app.api.caching import immutable, pointer
@@ -22,8 +25,9 @@ from app.db.tables import Floor, Map, Survey
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
-from app.services.artefacts import samples_from_bytes
+from app.services.artefacts import layers_from_bytes, samples_from_bytes
 from app.services.export_map import MEDIA_TYPES, export_map
+from app.viewer.layers import check_layer, nearest_height
 
 __all__ = ["MapView", "router"]
 
@@ -228,7 +232,7 @@ def read_field(map_id: Id, body: FieldQuery, context: ContextDep, identity: Read
     gradient = None
     if body.gradient:
         rows = values.gradient_uT_per_m.tolist()
-        gradient = shown([[[*dxy, None] for dxy in row] for row in rows])
+        gradient = shown([[[*slope, None][:3] for slope in row] for row in rows])
     return FieldAnswer(
         components=list(grid.component_names),
         mean_ut=shown(values.mean_uT.tolist()),
@@ -282,14 +286,19 @@ def get_heatmap(
     request: Request,
     context: ContextDep,
     identity: Reading,
-    layer: Annotated[
-        str, Query(max_length=40, pattern=r"^[a-z_]+$", examples=["norm", "bx", "sd", "gradient"])
-    ] = "norm",
+    layer: Annotated[str, Query(max_length=40, examples=["norm", "bx", "sd", "gradient"])] = "norm",
+    height_m: Annotated[Metres | None, Query(description="the nearest of the map's heights is shown")] = None,
 ) -> Response:
+    """A map's layers follow from its components; an answer to a wrong name lists them."""
     from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it
 
-    grid, sha256 = _ready_grid(context, identity, map_id)
-    return immutable(request, f"{sha256}-{layer}", lambda: heatmap_png(grid, layer), "image/png")
+    ready = _ready_map(context, identity, map_id)
+    stored = ready.stored_layers(context)
+    check_layer(ready.grid, layer, stored)
+    k = nearest_height(ready.grid, height_m)
+    return immutable(
+        request, ready.tag(layer, k), lambda: heatmap_png(ready.grid, layer, height_index=k, stored=stored), "image/png"
+    )
 
 
 @router.get(
@@ -319,10 +328,30 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
     return immutable(request, shown, page, "text/html")
 
 
-def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
+class _ReadyMap(NamedTuple):
+    grid: FieldGrid
+    sha256: str
+    layers_sha256: str | None
+
+    def stored_layers(self, context: Context) -> dict[str, NDArray[np.float32]]:
+        """The layers the fit left beside the grid; none for a map older than they are."""
+        return {} if self.layers_sha256 is None else layers_from_bytes(context.blobs.get(self.layers_sha256))
+
+    def tag(self, *parts: object) -> str:
+        """The name of what is made of the map: its content, what was asked for, and who made it."""
+        layers = [] if self.layers_sha256 is None else [self.layers_sha256[:16]]
+        return "-".join([self.sha256, *layers, *map(str, parts), __version__])
+
+
+def _ready_map(context: Context, identity: Identity, map_id: str) -> _ReadyMap:
     with context.transaction() as session:
         row = _find_map(session, identity, map_id)
-        sha256, status = row.grid_sha256, row.status
+        sha256, layers_sha256, status = row.grid_sha256, row.layers_sha256, row.status
     if sha256 is None:
         raise Conflict(f"map {map_id} is {status}; it has no field yet")
-    return context.grids.grid(sha256), sha256
+    return _ReadyMap(context.grids.grid(sha256), sha256, layers_sha256)
+
+
+def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
+    ready = _ready_map(context, identity, map_id)
+    return ready.grid, ready.sha256

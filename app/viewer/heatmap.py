@@ -1,27 +1,37 @@
-"""A layer of a map as a PNG picture with axes in metres and a colour bar with its unit, for reports."""
+"""A layer of a map as a PNG picture with axes in metres, a scale bar and a colour bar with its unit, for reports."""
 
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from app.field.grid import FieldGrid
-from app.viewer.layers import LAYERS, colour_scale, layer_values
+from app.geometry import Array
+from app.viewer.layers import LAYERS, NONE_STORED, ColourScale, StoredLayers, colour_scale, layer_values
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 __all__ = ["heatmap_png"]
 
 _DPI = 110
 _LONG_SIDE_INCHES = 8.0
+_UNKNOWN_GREY = "#d0d0d0"
 
 
-def heatmap_png(grid: FieldGrid, layer: str = "norm", title: str | None = None, height_index: int = 0) -> bytes:
-    """A PNG of one layer at one height. Unmeasured cells are blank; the same grid and title give the same bytes.
+def heatmap_png(
+    grid: FieldGrid,
+    layer: str = "norm",
+    title: str | None = None,
+    height_index: int = 0,
+    stored: StoredLayers = NONE_STORED,
+) -> bytes:
+    """A PNG of one layer at one height. Unmeasured cells are blank, measured cells of which the layer knows nothing
+    are grey; the same grid, layer and title give the same bytes.
 
     Raises InvalidInput, naming the layers this map has, for a layer it does not have.
     """
@@ -30,29 +40,35 @@ def heatmap_png(grid: FieldGrid, layer: str = "norm", title: str | None = None, 
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    values = layer_values(grid, layer, height_index)
+    values = layer_values(grid, layer, height_index, stored)
     figure = Figure(figsize=_size_inches(values.shape), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    _draw(figure, axes, grid, layer, height_index)
-    axes.set_title(title or f"{LAYERS[layer].title} at {grid.heights_m[height_index]:.2f} m", fontsize=11)
+    scale = colour_scale(layer, [values])
+    image = _draw_cells(axes, grid, values, scale, height_index)
+    _draw_colour_bar(figure, axes, image, layer, values, scale)
+    _draw_scale_bar(figure, axes)
+    text = title or f"{LAYERS[layer].title}, z = {grid.heights_m[height_index]:.2f} m"
+    unknown = bool(np.any(grid.measured[height_index] & np.isnan(values)))
+    axes.set_title(text + ("\n(grey: measured, but too little to tell)" if unknown else ""), fontsize=11, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
-def _draw(figure: Figure, axes: Axes, grid: FieldGrid, layer: str, height_index: int) -> None:
-    from matplotlib import colormaps
+def _draw_cells(axes: Axes, grid: FieldGrid, values: Array, scale: ColourScale, height_index: int) -> AxesImage:
+    from matplotlib.colors import ListedColormap
 
-    values = layer_values(grid, layer, height_index)
-    scale = colour_scale(layer, [values])
     x0, y0, _, x1, y1, _ = grid.bounds_m
     half = grid.resolution_m / 2
+    extent = (x0 - half, x1 + half, y0 - half, y1 + half)
+    unknown = np.ma.masked_equal(grid.measured[height_index] & np.isnan(values), False)
+    axes.imshow(unknown, origin="lower", extent=extent, cmap=ListedColormap([_UNKNOWN_GREY]), interpolation="nearest")
     image = axes.imshow(
         np.ma.masked_invalid(values),
         origin="lower",
-        extent=(x0 - half, x1 + half, y0 - half, y1 + half),
-        cmap=colormaps[scale.colour_map].resampled(2 if layer == "measured" else 256),
+        extent=extent,
+        cmap=scale.colour_map,
         vmin=scale.low,
         vmax=scale.high,
         interpolation="nearest",
@@ -60,17 +76,63 @@ def _draw(figure: Figure, axes: Axes, grid: FieldGrid, layer: str, height_index:
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.set_facecolor("white")
-    bar = figure.colorbar(image, ax=axes, shrink=0.85, extend="neither" if layer == "measured" else "both")
+    for axis, first_m, last_m in ((axes.xaxis, x0, x1), (axes.yaxis, y0, y1)):
+        if last_m - first_m < 0.15 * max(x1 - x0, y1 - y0):  # no room for two numbers
+            axis.set_ticks([round((first_m + last_m) / 2)])
+    return image
+
+
+def _draw_colour_bar(
+    figure: Figure, axes: Axes, image: AxesImage, layer: str, values: Array, scale: ColourScale
+) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     if layer == "measured":
-        bar.set_ticks([0.25, 0.75], labels=["not measured", "measured"])
-    else:
-        bar.set_label(f"{LAYERS[layer].title} ({LAYERS[layer].unit})")
+        bar = figure.colorbar(image, ax=axes, shrink=0.85, boundaries=[-0.5, 0.5, 1.5])
+        bar.set_ticks([0.0, 1.0], labels=["not measured", "measured"])
+        return
+    bar = figure.colorbar(image, ax=axes, shrink=0.85, extend=_beyond(values, scale))
+    about = LAYERS[layer]
+    bar.set_label(f"{about.title} ({about.unit})" if about.unit else about.title)
+    if layer == "coverage":
+        bar.locator = MaxNLocator(integer=True)
+        bar.update_ticks()
+
+
+def _draw_scale_bar(figure: Figure, axes: Axes) -> None:
+    """A bar of a round length, about a fifth of the floor's longer side, under the picture, where it hides nothing."""
+    from matplotlib.transforms import ScaledTranslation
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+
+    sides_m = (np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+    length_m = _round_length_m(float(max(sides_m)) / 5.0)
+    below = axes.transAxes + ScaledTranslation(0.0, -0.45, figure.dpi_scale_trans)
+    bar = AnchoredSizeBar(
+        axes.transData, length_m, f"{length_m:g} m", "upper center", pad=0.1, sep=3, frameon=False,
+        bbox_to_anchor=(0.5, 0.0), bbox_transform=below,
+    )  # fmt: skip
+    bar.size_bar.get_children()[0].set_linewidth(2.5)
+    axes.add_artist(bar)
+
+
+def _beyond(values: Array, scale: ColourScale) -> Literal["neither", "min", "max", "both"]:
+    """At which ends of the scale there are values outside it."""
+    below, above = bool(np.any(values < scale.low)), bool(np.any(values > scale.high))
+    if below and above:
+        return "both"
+    return "min" if below else "max" if above else "neither"
+
+
+def _round_length_m(about_m: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above `about_m`."""
+    power = 10.0 ** np.floor(np.log10(about_m))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= about_m * (1.0 + 1e-9)))
 
 
 def _size_inches(shape: tuple[int, ...]) -> tuple[float, float]:
     """The picture takes the shape of the floor, within reason, with room for the colour bar."""
     ny, nx = shape
-    aspect = float(np.clip(ny / nx, 0.35, 2.0))
+    aspect = float(np.clip(ny / nx, 0.25, 2.0))
     if aspect <= 1.0:
-        return _LONG_SIDE_INCHES, _LONG_SIDE_INCHES * aspect * 0.85 + 0.9
-    return _LONG_SIDE_INCHES / aspect + 1.6, _LONG_SIDE_INCHES
+        return _LONG_SIDE_INCHES, _LONG_SIDE_INCHES * aspect * 0.85 + 1.2
+    return _LONG_SIDE_INCHES / aspect + 1.6, _LONG_SIDE_INCHES + 0.3

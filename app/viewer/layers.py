@@ -1,8 +1,9 @@
 """Layers of a map as arrays and colours: one layer at one height, with its unit and a colour-blind-safe colour map."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,22 @@ from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components
 from app.geometry import Array
 
-__all__ = ["LAYERS", "ColourScale", "Layer", "colour_scale", "layer_names", "layer_values", "legend_html"]
+__all__ = [
+    "LAYERS",
+    "STORED_LAYERS",
+    "ColourScale",
+    "Layer",
+    "StoredLayers",
+    "check_layer",
+    "colour_scale",
+    "layer_names",
+    "layer_values",
+    "legend_html",
+    "nearest_height",
+]
+
+StoredLayers = Mapping[str, NDArray[np.floating]]  # (nz, ny, nx) by name, of one map
+NONE_STORED: StoredLayers = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,32 +49,49 @@ LAYERS: dict[str, Layer] = {
     "vertical": Layer("Vertical component (up)", "µT"),
     "sd": Layer("Uncertainty (1 sd, all components)", "µT", "cividis"),
     "gradient": Layer("Gradient along the floor", "µT/m"),
+    "coverage": Layer("Coverage (surveys within 1 m)", "", "cividis"),
+    "conflict": Layer("Conflict (errors of left-out surveys / their stated sd)", "", "magma"),
     "measured": Layer("Measured cells", "", "cividis"),
 }
+STORED_LAYERS = ("coverage", "conflict")  # from the fit, beside the grid: an older map has none
 
 
-def layer_names(components: Components) -> tuple[str, ...]:
-    """The layers a map of these components has."""
+def layer_names(components: Components, stored: Collection[str] = ()) -> tuple[str, ...]:
+    """The layers a map of these components has, with those `stored` beside its grid."""
     own = () if components == "norm" else COMPONENT_NAMES[components]
-    return ("norm", *own, "sd", "gradient", "measured")
+    return ("norm", *own, "sd", "gradient", *(name for name in STORED_LAYERS if name in stored), "measured")
 
 
-def layer_values(grid: FieldGrid, layer: str, height_index: int = 0) -> Array:
+def nearest_height(grid: FieldGrid, height_m: float | None) -> int:
+    """The index of the map's height that is nearest to `height_m` (of two as near the lower; None: the lowest)."""
+    return 0 if height_m is None else int(np.argmin(np.abs(grid.heights_m - height_m)))
+
+
+def check_layer(grid: FieldGrid, layer: str, stored: Collection[str] = ()) -> None:
+    """Raises InvalidInput, naming the layers this map has, when it has not this one."""
+    known = layer_names(grid.components, stored)
+    if layer not in known:
+        older = " (maps built again have it)" if layer in STORED_LAYERS else ""
+        raise InvalidInput(
+            f"this {grid.components} map has no layer {layer!r}{older}; ask for one of {', '.join(known)}"
+        )
+
+
+def layer_values(grid: FieldGrid, layer: str, height_index: int = 0, stored: StoredLayers = NONE_STORED) -> Array:
     """One layer at one height: (ny, nx), NaN where nothing was measured ("measured" itself: 1 and 0, never NaN).
 
     norm is the magnitude of the mean field; sd the root of the summed variances of the components; gradient the
     Frobenius norm of the derivative with x and y. Raises InvalidInput naming the layers, or heights, of this map.
     """
-    known = layer_names(grid.components)
-    if layer not in known:
-        raise InvalidInput(f"this {grid.components} map has no layer {layer!r}; ask for one of {', '.join(known)}")
+    check_layer(grid, layer, stored)
     if not 0 <= height_index < len(grid.heights_m):
         heights = ", ".join(f"{k}: {z:.2f} m" for k, z in enumerate(grid.heights_m))
         raise InvalidInput(f"this map has no height {height_index}; its heights are {heights}")
     measured = grid.measured[height_index]
     if layer == "measured":
         return np.asarray(measured.astype(np.float64))
-    return np.asarray(np.where(measured, _raw_values(grid, layer, height_index), np.nan))
+    raw = stored[layer][height_index] if layer in STORED_LAYERS else _raw_values(grid, layer, height_index)
+    return np.asarray(np.where(measured, raw, np.nan), dtype=np.float64)
 
 
 def _raw_values(grid: FieldGrid, layer: str, k: int) -> Array:
@@ -67,7 +100,8 @@ def _raw_values(grid: FieldGrid, layer: str, k: int) -> Array:
     if layer == "sd":
         return np.asarray(np.linalg.norm(grid.sd_uT[k].astype(np.float64), axis=-1))
     if layer == "gradient":
-        return np.asarray(np.sqrt(np.square(grid.gradient_uT_per_m[k], dtype=np.float64).sum(axis=(-2, -1))))
+        along = grid.gradient_uT_per_m[k, ..., :2]  # a third column, where there is one, is with height
+        return np.asarray(np.sqrt(np.square(along, dtype=np.float64).sum(axis=(-2, -1))))
     return np.asarray(grid.mean_uT[k, ..., grid.component_names.index(layer)].astype(np.float64))
 
 

@@ -3,11 +3,16 @@
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import netcdf_file
+
+from app.db.tables import Floor, Map
+from app.field.fit import fit_map
+from app.services.artefacts import layers_from_bytes, layers_to_bytes
 
 
 def test_the_field_at_points_is_the_true_field_and_never_invented(
@@ -77,10 +82,75 @@ def test_heat_maps_are_pictures(service: Any, active_map: str, layer: str) -> No
     assert answer.content.startswith(b"\x89PNG")
 
 
-def test_an_unknown_layer_names_the_layers_there_are(service: Any, active_map: str) -> None:
-    answer = service.http.get(f"/v1/maps/{active_map}/heatmap.png", params={"layer": "colour"})
-    assert answer.status_code == 422
-    assert "norm" in answer.text
+def test_the_nearest_height_is_the_one_picture_of_all_near_it(service: Any, active_map: str) -> None:
+    path = f"/v1/maps/{active_map}/heatmap.png"
+    etags = {service.http.get(path, params=asked).headers["etag"] for asked in ({}, {"height_m": 1}, {"height_m": 99})}
+    assert len(etags) == 1, "a map of one height"
+    assert service.http.get(path, params={"layer": "sd"}).headers["etag"] not in etags
+    assert service.http.get(path, headers={"If-None-Match": etags.pop()}).status_code == 304
+    assert service.http.get(path, params={"height_m": "nan"}).status_code == 422
+
+
+@pytest.mark.parametrize("layer", ["colour", "coverage", "horizontal", "a b\r\nc", "Ω"])
+def test_a_layer_it_does_not_have_names_the_layers_there_are(service: Any, old_map: str, layer: str) -> None:
+    for headers in ({}, {"If-None-Match": "*"}):
+        answer = service.http.get(f"/v1/maps/{old_map}/heatmap.png", params={"layer": layer}, headers=headers)
+        assert answer.status_code == 422
+        assert "one of norm, bx, by, bz, sd, gradient" in answer.json()["detail"]
+
+
+@pytest.fixture(scope="module")
+def old_map(service: Any, active_map: str) -> str:
+    """A map as it was built before fits had further layers."""
+    return _copy_of_map(service, active_map, None)
+
+
+@pytest.fixture(scope="module")
+def layered_map(service: Any, active_map: str) -> str:
+    """A map with a layer of its fit: coverage is one on the west half, two on the east."""
+    with service.context.transaction() as session:
+        sha256 = session.get_one(Map, active_map).grid_sha256
+    grid = service.context.grids.grid(sha256)
+    coverage = np.ones(grid.measured.shape, np.float32)
+    coverage[:, :, grid.measured.shape[2] // 2 :] = 2.0
+    return _copy_of_map(service, active_map, service.context.blobs.put(layers_to_bytes({"coverage": coverage})))
+
+
+def _copy_of_map(service: Any, map_id: str, layers_sha256: str | None) -> str:
+    with service.context.transaction() as session:
+        row = session.get_one(Map, map_id)
+        names = [column.name for column in Map.__table__.columns if column.name != "id"]
+        copy = Map(**{name: getattr(row, name) for name in names} | {"layers_sha256": layers_sha256})
+        session.add(copy)
+        session.flush()
+        return copy.id
+
+
+def test_a_layer_of_the_fit_is_shown_and_has_its_own_tag(service: Any, layered_map: str, old_map: str) -> None:
+    picture = service.http.get(f"/v1/maps/{layered_map}/heatmap.png", params={"layer": "coverage"})
+    assert picture.content.startswith(b"\x89PNG")
+    etags = [service.http.get(f"/v1/maps/{m}/heatmap.png").headers["etag"] for m in (layered_map, old_map)]
+    assert etags[0] != etags[1]
+
+
+def test_what_a_fit_leaves_beside_its_grid_is_kept(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fit_with_layers(*arguments: Any) -> Any:
+        fitted = fit_map(*arguments)
+        return replace(fitted, layers={"conflict": np.full(fitted.grid.measured.shape, 1.5)})
+
+    monkeypatch.setattr("app.services.build_map.fit_map", fit_with_layers)
+    floor = new_floor()
+    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
+    service.run_jobs()
+    with service.context.transaction() as session:
+        row = session.get_one(Map, session.get_one(Floor, floor).active_map_id)
+        sha256, map_id = row.layers_sha256, row.id
+    layers = layers_from_bytes(service.context.blobs.get(sha256))
+    assert list(layers) == ["conflict"]
+    assert (layers["conflict"] == 1.5).all()
+    assert service.http.get(f"/v1/maps/{map_id}/heatmap.png", params={"layer": "conflict"}).status_code == 200
 
 
 def test_the_static_view_is_one_self_contained_page(service: Any, active_map: str) -> None:

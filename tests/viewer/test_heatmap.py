@@ -51,6 +51,36 @@ def test_long_corridors_give_pictures_of_bounded_size(grid_of, size_m):
     assert min(nx, ny) >= 300
 
 
+@pytest.mark.parametrize(("size_m", "bar_m"), [((24.0, 14.0), 2.0), ((4.0, 9.75), 2.0), ((240.0, 120.0), 20.0)])
+def test_the_scale_bar_is_as_long_as_it_says(grid_of, size_m, bar_m):
+    """Against the frame of the plot, whose width in metres is known: one cell more than its centres are apart."""
+    grid = grid_of(size_m=size_m, resolution_m=0.5)
+    dark = imread(io.BytesIO(heatmap_png(grid, "norm")))[..., :3].max(axis=-1) < 0.35
+    runs = np.array([_longest_run(row) for row in dark])
+    frame_px = runs[: _last_above(runs, 0.9 * runs.max()) + 1].max()
+    bar_px = runs[_last_above(runs, 0.9 * runs.max()) + 5 :].max()
+    assert bar_px / frame_px == pytest.approx(bar_m / (size_m[0] + 0.5), abs=4.0 / frame_px)
+
+
+def test_a_stored_layer_is_drawn_with_grey_where_it_knows_nothing(grid_of):
+    grid = grid_of(heights=2)
+    conflict = np.ones(grid.measured.shape, np.float32)
+    conflict[1, :, :40] = np.nan
+    pictures = [heatmap_png(grid, "conflict", height_index=k, stored={"conflict": conflict}) for k in (0, 1)]
+    grey = [(np.abs(imread(io.BytesIO(p))[..., :3] - 0xD0 / 255).max(axis=-1) < 0.01).mean() for p in pictures]
+    assert grey[0] < 0.001
+    assert grey[1] > 0.1
+
+
+def _longest_run(row) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _last_above(values, threshold) -> int:
+    return int(np.flatnonzero(values >= threshold)[-1])
+
+
 def _coloured_share(png: bytes) -> float:
     rgb = imread(io.BytesIO(png))[..., :3]
     return float((np.ptp(rgb, axis=-1) > 0.1).mean())

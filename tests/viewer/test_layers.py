@@ -1,11 +1,21 @@
 """Layers as numbers, colours and legends."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from app.errors import InvalidInput
 from app.field.samples import COMPONENT_NAMES
-from app.viewer.layers import LAYERS, ColourScale, colour_scale, layer_names, layer_values, legend_html
+from app.viewer.layers import (
+    LAYERS,
+    ColourScale,
+    colour_scale,
+    layer_names,
+    layer_values,
+    legend_html,
+    nearest_height,
+)
 
 
 @pytest.mark.parametrize("components", ["vector", "level", "norm"])
@@ -19,6 +29,32 @@ def test_every_layer_of_a_map_leaves_unmeasured_cells_out(grid_of, components):
         assert values.shape == grid.measured.shape[1:]
         if layer != "measured":
             np.testing.assert_array_equal(np.isfinite(values), grid.measured[1])
+
+
+def test_stored_layers_are_those_of_the_map_where_it_was_measured(grid_of):
+    grid = grid_of("level", heights=2)
+    coverage = np.arange(grid.measured.size, dtype=np.float32).reshape(grid.measured.shape)
+    assert "coverage" in layer_names("level", {"coverage": coverage})
+    values = layer_values(grid, "coverage", 1, {"coverage": coverage})
+    np.testing.assert_array_equal(values[grid.measured[1]], coverage[1][grid.measured[1]])
+    assert np.isnan(values[~grid.measured[1]]).all()
+    with pytest.raises(InvalidInput, match=r"no layer 'conflict' \(maps built again have it\).* coverage, meas"):
+        layer_values(grid, "conflict", 1, {"coverage": coverage})
+
+
+def test_the_nearest_height_is_taken(grid_of):
+    grid = grid_of(heights=3)  # 1.2, 1.7 and 2.2 m
+    assert [nearest_height(grid, z) for z in (None, -9.0, 1.44, 1.46, 1.96, 50.0)] == [0, 0, 0, 1, 2, 2]
+
+
+def test_the_gradient_along_the_floor_leaves_the_vertical_out(grid_of):
+    grid = grid_of()
+    upward = np.full((*grid.gradient_uT_per_m.shape[:-1], 1), 9.0, np.float32)
+    both = SimpleNamespace(
+        components="vector", heights_m=grid.heights_m, measured=grid.measured,
+        gradient_uT_per_m=np.concatenate([grid.gradient_uT_per_m, upward], axis=-1),
+    )  # fmt: skip
+    np.testing.assert_array_equal(layer_values(both, "gradient"), layer_values(grid, "gradient"))
 
 
 def test_norm_agrees_across_components(grid_of):
@@ -54,7 +90,7 @@ def test_scales_cover_the_values_of_every_floor_and_survive_none_and_one():
 
 def test_colours_are_monotone_in_lightness():
     """So that the picture can be read without telling hues apart."""
-    for name in ("viridis", "cividis"):
+    for name in sorted({layer.colour_map for layer in LAYERS.values()}):
         rgb = ColourScale(0.0, 1.0, name).rgb(np.linspace(0.0, 1.0, 64)) / 255.0
         linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
         luminance = linear @ [0.2126, 0.7152, 0.0722]
