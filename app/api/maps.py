@@ -26,7 +26,7 @@ from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFou
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
-from app.services.export_map import MEDIA_TYPES, export_map
+from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
 
 __all__ = ["MapView", "router"]
@@ -264,14 +264,18 @@ def get_export(
     request: Request,
     context: ContextDep,
     identity: Reading,
-    format: Annotated[Literal["netcdf", "zarr", "npz", "covjson", "csv"], Query()],
+    format: Annotated[ExportFormat, Query()],
+    gradient: Annotated[bool, Query(description="also the derivatives with x and y (z where the map knows it)")] = True,
 ) -> Response:
-    if format == "zarr":
-        raise InvalidInput("zarr is not offered yet", Fault("/query/format", f"use one of {', '.join(MEDIA_TYPES)}"))
-    grid, sha256 = _ready_grid(context, identity, map_id)
-    name = f'attachment; filename="isodyn-{sha256[:12]}.{ {"netcdf": "nc"}.get(format, format) }"'
-    response = immutable(request, f"{sha256}-{format}", lambda: export_map(grid, format), MEDIA_TYPES[format])
-    response.headers["Content-Disposition"] = name
+    """Mean, standard deviation, gradient and the layers of the fit, at every height; unmeasured cells are missing."""
+    ready = _ready_map(context, identity, map_id)
+
+    def file() -> bytes:
+        return export_map(ready.grid, format, ready.sha256, ready.stored_layers(context), gradient)
+
+    response = immutable(request, ready.tag(format, f"gradient={gradient}"), file, MEDIA_TYPES[format])
+    name = f"isodyn-{ready.sha256[:12]}.{EXTENSIONS[format]}"
+    response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
     return response
 
 

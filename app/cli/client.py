@@ -99,7 +99,7 @@ def export(
     output: Annotated[Path, typer.Argument(help="file to write")],
     key: KeyOption,
     url: Url = DEFAULT_URL,
-    format: Annotated[str, typer.Option(help="netcdf, npz, covjson or csv")] = "netcdf",
+    format: Annotated[str, typer.Option(help="netcdf, zarr, npz, covjson or csv")] = "netcdf",
 ) -> None:
     """Write a map as a file for other tools."""
     answer = Api(url, key).call("GET", f"/v1/maps/{map_id}/export", params={"format": format})

@@ -52,6 +52,21 @@ def test_every_export_carries_the_same_field_and_a_strong_etag(service: Any, act
     assert asked["mean_ut"][0][0] == pytest.approx(bx, abs=2e-3)
 
 
+@pytest.mark.parametrize("format", ["netcdf", "zarr", "npz", "csv", "covjson"])
+def test_an_export_has_the_layers_of_the_fit_and_no_gradient_on_request(
+    service: Any, layered_map: str, old_map: str, format: str
+) -> None:
+    def export(map_id: str, **more: str) -> Any:
+        return service.http.get(f"/v1/maps/{map_id}/export", params={"format": format, **more})
+
+    answers = [export(layered_map), export(layered_map, gradient="false"), export(old_map)]
+    assert [answer.status_code for answer in answers] == [200, 200, 200]
+    assert len({answer.headers["etag"] for answer in answers}) == 3
+    assert [b"coverage" in answer.content for answer in answers] == [True, True, False]
+    assert [b"dbx_dy_ut_per_m" in answer.content for answer in answers] == [True, False, True]
+    assert answers[0].headers["content-disposition"].startswith('attachment; filename="isodyn-')
+
+
 def _read(format: str, data: bytes) -> tuple[float, float, float]:
     """One measured cell of an export: x, y, bx."""
     if format == "csv":
@@ -70,7 +85,7 @@ def _read(format: str, data: bytes) -> tuple[float, float, float]:
     else:
         with netcdf_file(io.BytesIO(data), mmap=False) as file:
             values, x, y = (np.array(file.variables[name][:]) for name in ("bx_ut", "x", "y"))
-            assert file.variables["bx_ut"].units == b"microtesla"
+            assert file.variables["bx_ut"].units == b"uT"
     j, i = values.shape[1] // 2, values.shape[2] // 2
     return float(x[i]), float(y[j]), float(values[0, j, i])
 
