@@ -104,7 +104,7 @@ class FieldAnswer(BaseModel):
     points_m: Annotated[list[list[float]], Field(description="the points, as asked")]
     gradient_ut_per_m: Annotated[
         list[list[list[float | None]] | None] | None,
-        Field(description="per component, with x, y, z; z is null in a map of one height"),
+        Field(description="per component, with x, y, z; z is null where the map does not know it"),
     ] = None
 
 

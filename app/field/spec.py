@@ -4,9 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from app.field.grid import FieldGrid
 from app.field.samples import Components
-from app.geometry import Array
 
 __all__ = [
     "ChangePoint",
@@ -153,5 +155,5 @@ class FittedMap:
     score: Score | None
     score_reason: str | None  # why there is no score
     consistency: dict[str, ConsistencyReport] = field(default_factory=dict)  # by survey id
-    layers: dict[str, Array] = field(default_factory=dict)
+    layers: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     out_of_date: tuple[OutOfDateRegion, ...] = ()
