@@ -122,11 +122,16 @@ class ColourScale:
 
 
 def colour_scale(layer: str, values: Iterable[Array]) -> ColourScale:
-    """One scale for several floors: the 1st to the 99th percentile of every value that is not NaN."""
+    """One scale for several floors: the 1st to the 99th percentile of every value that is not NaN.
+
+    That of conflict reaches from 0 to 2 at least: surveys that agree as well as they state must not look alarming.
+    """
     seen = np.concatenate([np.zeros(0), *(v[np.isfinite(v)] for v in values)])
     if layer == "measured" or len(seen) == 0:
         return ColourScale(0.0, 1.0, LAYERS[layer].colour_map)
     low, high = (float(q) for q in np.percentile(seen, [1.0, 99.0]))
+    if layer == "conflict":
+        low, high = 0.0, max(2.0, high)
     if high - low < 1e-6 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
     return ColourScale(low, high, LAYERS[layer].colour_map)

@@ -88,6 +88,12 @@ def test_scales_cover_the_values_of_every_floor_and_survive_none_and_one():
         assert scale.high > scale.low
 
 
+def test_the_scale_of_conflict_shows_agreement_as_calm_and_conflict_in_full():
+    calm, torn = (colour_scale("conflict", [np.full(9, value)]) for value in (0.9, 7.0))
+    assert (calm.low, calm.high) == (0.0, 2.0)
+    assert (torn.low, torn.high) == (0.0, 7.0)
+
+
 def test_colours_are_monotone_in_lightness():
     """So that the picture can be read without telling hues apart."""
     for name in sorted({layer.colour_map for layer in LAYERS.values()}):
