@@ -130,4 +130,5 @@ def _least_squares(design: Array, target: Array, half_log_det: float) -> _Fit:
         variance_uT2 = max((energy - float(right @ solution)) / degrees, 1e-6)
     log_det = np.linalg.slogdet(precision)[1] + 2.0 * np.log(PRIOR_SD_UT**2 / variance_uT2)
     nats = 0.5 * degrees * np.log(variance_uT2) + half_log_det + 0.5 * log_det
-    return _Fit(float(nats), variance_uT2, solution[3:], variance_uT2 * np.linalg.inv(precision)[3:, 3:])
+    covariance_uT2 = variance_uT2 * np.linalg.inv(precision)
+    return _Fit(float(nats), variance_uT2, np.asarray(solution[3:]), np.asarray(covariance_uT2[3:, 3:]))
