@@ -7,22 +7,28 @@ so what differs is their offsets, each turned by its own attitude:
 
 One equation per meeting of two stretches, since errors along a walk are one error over metres; outliers are
 down-weighted (Huber), and offsets are shrunk towards zero by a Student prior, so that a session nothing ties stays as
-the phone left it and one that is off by 40 uT is found. An offset common to all sessions along the vertical cannot be
-told from the field; the map then holds it, which is harmless to a phone that has it too.
+the phone left it and one that is off by 40 uT is found. Turning the phone tells an offset across the vertical; one
+along it shows only as a difference between sessions, which walked elsewhere, so it is shrunk harder. One common to all
+sessions along the vertical cannot be told from the field; the map then holds it, which is harmless to a phone that has
+it too. What is not known of an offset stays with its walks as variance.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from app.field.samples import Samples
+from app.field.samples import Components, Samples
 from app.geometry import Array, rotate_by_quaternion
 
-__all__ = ["SessionBias", "estimate_session_biases", "remove_session_biases"]
+__all__ = [
+    "SessionBias", "SessionCalibration", "calibrate_sessions", "estimate_session_biases", "offset_variance_uT2",
+    "remove_session_biases",
+]  # fmt: skip
 
 STRETCH_M = 0.6
 MEETING_M = 2.0
@@ -30,17 +36,48 @@ MEETING_M = 2.0
 PATCH_M = 4.0
 """Errors of one walk are one error over about this distance."""
 RETURN_M = 10.0
-MEETING_SD_UT = 5.5
-PRIOR_SCALE_UT, PRIOR_FREEDOM = 5.0, 3.0
+MEETING_SD_UT = 8.0
+PRIOR_SCALE_UT, PRIOR_VERTICAL_SCALE_UT, PRIOR_FREEDOM = 3.0, 1.5, 3.0
+"""Across and along a session's mean vertical; these and the meetings' sd by walks left out, whole, in a mall."""
 _ITERATIONS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionBias:
-    """bias_body_uT (3,) left in the samples of a session, and its standard deviation (3,)."""
+    """bias_body_uT (3,) left in the samples of a session, and its posterior covariance (3, 3) uT^2."""
 
     bias_body_uT: Array
-    sd_uT: Array
+    covariance_uT2: Array
+
+    @property
+    def sd_uT(self) -> Array:
+        """(3,) standard deviations."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance_uT2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionCalibration:
+    """walks: without the offsets of their sessions; biases: by session.
+
+    offset_variance_uT2: survey id -> (c,) variance of what is left of the offset in the features of its samples, a
+    constant of the survey; surveys without session or attitude are not in it.
+    """
+
+    walks: dict[str, Samples]
+    offset_variance_uT2: dict[str, Array]
+    biases: dict[str, SessionBias]
+
+    def as_json(self) -> list[dict[str, object]]:
+        """Plain JSON, one entry per session: its label, surveys, offset in the body frame and sds."""
+        return [
+            {
+                "session": session,
+                "surveys": [name for name, samples in self.walks.items() if samples.session == session],
+                "bias_body_ut": bias.bias_body_uT.tolist(),
+                "sd_ut": bias.sd_uT.tolist(),
+            }
+            for session, bias in self.biases.items()
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +92,40 @@ class _Stretches:
     session: NDArray[np.int64]
 
 
+def calibrate_sessions(walks: Mapping[str, Samples], components: Components) -> SessionCalibration:
+    """Walks of one floor without the offsets of their sessions, and what is not known of them, for a map.
+
+    Walks without session or attitude are left as they are.
+    """
+    biases = estimate_session_biases(walks)
+    cleaned = remove_session_biases(walks, biases)
+    left = {
+        name: offset_variance_uT2(samples, biases[str(samples.session)], components).mean(axis=0)
+        for name, samples in cleaned.items()
+        if samples.session in biases and _usable(samples)
+    }
+    return SessionCalibration(cleaned, left, biases)
+
+
+def offset_variance_uT2(samples: Samples, bias: SessionBias, components: Components) -> Array:
+    """(n, c) variance that what is unknown of the offset puts into every sample's features, to first order."""
+    assert samples.q_body_to_building is not None
+    rotation = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()
+    slopes = _feature_slopes(samples.B_uT, components) @ rotation
+    return np.asarray(np.einsum("nck,kl,ncl->nc", slopes, bias.covariance_uT2, slopes))
+
+
+def _feature_slopes(B_uT: Array, components: Components) -> Array:
+    """(n, c, 3) derivative of the features by the field: itself, (horizontal, vertical), or norm."""
+    if components == "vector":
+        return np.broadcast_to(np.eye(3), (len(B_uT), 3, 3))
+    level = B_uT * [1.0, 1.0, 0.0] if components == "level" else B_uT
+    direction = level / np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
+    if components == "norm":
+        return np.asarray(direction[:, None, :])
+    return np.stack([direction, np.broadcast_to([0.0, 0.0, 1.0], B_uT.shape)], axis=1)
+
+
 def estimate_session_biases(walks: Mapping[str, Samples]) -> dict[str, SessionBias]:
     """The offset of every session among walks of one floor that know their attitude and their session."""
     known = {name: walks[name] for name in sorted(walks) if _usable(walks[name])}
@@ -63,9 +134,9 @@ def estimate_session_biases(walks: Mapping[str, Samples]) -> dict[str, SessionBi
         return {}
     stretches = _stretches(known, sessions)
     design, difference_uT = _meetings(stretches, len(sessions))
-    bias_uT, covariance = _solve(design, difference_uT, len(sessions))
-    sd_uT = np.sqrt(np.diag(covariance)).reshape(-1, 3)
-    return {name: SessionBias(b, s) for name, b, s in zip(sessions, bias_uT.reshape(-1, 3), sd_uT, strict=True)}
+    bias_uT, covariance = _solve(design, difference_uT, _prior_precisions(stretches, len(sessions)))
+    parts = [slice(3 * number, 3 * number + 3) for number in range(len(sessions))]
+    return {name: SessionBias(bias_uT[p], covariance[p, p]) for name, p in zip(sessions, parts, strict=True)}
 
 
 def remove_session_biases(walks: Mapping[str, Samples], biases: Mapping[str, SessionBias]) -> dict[str, Samples]:
@@ -122,15 +193,31 @@ def _meetings(s: _Stretches, sessions: int) -> tuple[Array, Array]:
     return design.transpose(0, 2, 1, 3).reshape(m, 3, 3 * sessions), difference_uT
 
 
-def _solve(design: Array, difference_uT: Array, sessions: int) -> tuple[Array, Array]:
-    """Robust posterior mean (3 sessions,) and covariance by iteratively reweighted least squares."""
-    bias = np.zeros(3 * sessions)
+def _prior_precisions(s: _Stretches, sessions: int) -> list[Array]:
+    """Per session the (3, 3) precision of a Gaussian prior: tighter along its mean vertical than across."""
+    precisions = []
+    for session in range(sessions):
+        up = s.rotation[s.session == session, 2].mean(axis=0)
+        along = np.outer(up, up) / (up @ up)
+        precisions.append((np.eye(3) - along) / PRIOR_SCALE_UT**2 + along / PRIOR_VERTICAL_SCALE_UT**2)
+    return precisions
+
+
+def _solve(design: Array, difference_uT: Array, priors: Sequence[Array]) -> tuple[Array, Array]:
+    """Robust posterior mean (3 sessions,) and covariance by iteratively reweighted least squares.
+
+    The mean is the mode under the Student prior; the covariance has the prior's variance where nothing ties a session,
+    not the curvature at its peak.
+    """
+    prior = block_diag(*priors)
+    bias = np.zeros(len(prior))
     for _ in range(_ITERATIONS):
         left_uT = np.linalg.norm(difference_uT - design @ bias, axis=1)
         weight = MEETING_SD_UT**-2 / np.maximum(1.0, left_uT / (2.0 * MEETING_SD_UT))
-        size = np.sum(np.square(bias.reshape(-1, 3)), axis=1) / PRIOR_SCALE_UT**2
-        prior = np.repeat((PRIOR_FREEDOM + 3.0) / (PRIOR_FREEDOM + size), 3) / PRIOR_SCALE_UT**2
-        precision = np.einsum("mka,m,mkb->ab", design, weight, design, optimize=True) + np.diag(prior)
-        covariance = np.linalg.inv(precision)
-        bias = covariance @ np.einsum("mka,m,mk->a", design, weight, difference_uT, optimize=True)
-    return bias, covariance
+        tied = np.einsum("mka,m,mkb->ab", design, weight, design, optimize=True)
+        right = np.einsum("mka,m,mk->a", design, weight, difference_uT, optimize=True)
+        size = np.sum((bias * (prior @ bias)).reshape(-1, 3), axis=1)
+        shrink = np.repeat((PRIOR_FREEDOM + 3.0) / (PRIOR_FREEDOM + size), 3)
+        bias = np.linalg.solve(tied + shrink * prior, right)
+    widest = (PRIOR_FREEDOM - 2.0) / PRIOR_FREEDOM
+    return bias, np.linalg.inv(tied + np.minimum(shrink, widest) * prior)

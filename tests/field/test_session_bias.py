@@ -5,7 +5,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from app.field.samples import Samples
-from app.field.session_bias import estimate_session_biases, remove_session_biases
+from app.field.session_bias import (
+    PRIOR_SCALE_UT,
+    PRIOR_VERTICAL_SCALE_UT,
+    SessionBias,
+    calibrate_sessions,
+    estimate_session_biases,
+    offset_variance_uT2,
+    remove_session_biases,
+)
 
 BIASES = {"a": [0.0, 0.0, 0.0], "b": [4.0, -3.0, 0.0], "c": [-11.0, 38.0, 0.0]}
 
@@ -54,7 +62,9 @@ def test_a_session_that_meets_nobody_stays_as_it_was():
     alone = Samples(far.t_s, far.p_building_m + 500.0, far.B_uT, "building", far.q_body_to_building, "alone")
     found = estimate_session_biases({**walks, "alone": alone})["alone"]
     np.testing.assert_array_equal(found.bias_body_uT, 0.0)
-    assert np.all(found.sd_uT > 3.0)
+    across, vertical = PRIOR_SCALE_UT * np.sqrt(3.0), PRIOR_VERTICAL_SCALE_UT * np.sqrt(3.0)
+    spread = np.sqrt(np.linalg.eigvalsh(found.covariance_uT2))
+    np.testing.assert_allclose(spread, [vertical, across, across])
 
 
 def test_walks_without_session_or_attitude_are_left_alone():
@@ -72,3 +82,41 @@ def test_order_of_the_walks_does_not_matter(seed):
     back = estimate_session_biases(dict(reversed(walks.items())))
     for name in forth:
         np.testing.assert_array_equal(forth[name].bias_body_uT, back[name].bias_body_uT)
+
+
+def test_calibration_says_what_is_left_of_every_survey():
+    walks = make_walks(np.random.default_rng(7))
+    plain = Samples(walks["walk-00"].t_s, walks["walk-00"].p_building_m, walks["walk-00"].B_uT, "building")
+    calibration = calibrate_sessions({**walks, "plain": plain}, "vector")
+    assert calibration.walks["plain"] is plain
+    assert set(calibration.offset_variance_uT2) == set(walks)
+    for name, variance in calibration.offset_variance_uT2.items():
+        left = (calibration.walks[name].B_uT - field_uT(walks[name].p_building_m)).mean(axis=0)
+        assert np.all(np.abs(left[:2]) < 4 * np.sqrt(variance[:2] + 1.0)), name
+    report = {entry["session"]: entry for entry in calibration.as_json()}
+    assert report["c"]["bias_body_ut"][1] == pytest.approx(38.0, abs=1.5)
+    assert report["a"]["surveys"] == [name for name in sorted(walks) if walks[name].session == "a"]
+
+
+def test_one_session_alone_tells_its_offset_by_walking_both_ways():
+    walks = {name: s for name, s in make_walks(np.random.default_rng(8)).items() if s.session == "c"}
+    calibration = calibrate_sessions(walks, "vector")
+    assert set(calibration.biases) == {"c"}
+    np.testing.assert_allclose(calibration.biases["c"].bias_body_uT[:2], BIASES["c"][:2], atol=5.0)
+
+
+@pytest.mark.parametrize("components", ["vector", "level", "norm"])
+def test_variance_left_is_that_of_the_features_of_drawn_offsets(components):
+    """Against a naive second way: draw offsets, turn them into the building, take the features again."""
+    rng = np.random.default_rng(9)
+    walk = make_walks(rng)["walk-02"]
+    root = 0.3 * rng.standard_normal((3, 3))
+    drawn = rng.standard_normal((4000, 3)) @ root.T
+    turn = Rotation.from_quat(walk.q_body_to_building[0], scalar_first=True)
+    features = [
+        Samples(walk.t_s[:1], walk.p_building_m[:1], walk.B_uT[:1] + turn.apply(b), "building").features(components)[0]
+        for b in drawn
+    ]
+    found = offset_variance_uT2(walk, SessionBias(np.zeros(3), root @ root.T), components)
+    assert found.shape == walk.features(components).shape
+    np.testing.assert_allclose(found[0], np.var(features, axis=0), rtol=0.1)
