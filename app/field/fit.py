@@ -5,7 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from app.errors import InvalidInput
+from app.field.conflict import quality_layers
 from app.field.consistency import check_surveys
+from app.field.drift import out_of_date_regions
 from app.field.estimate import FieldEstimate
 from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
@@ -31,6 +33,8 @@ def _silent(fraction: float, message: str) -> None:
 def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _silent) -> FittedMap:
     """Fit a map from the walks of its surveys (survey id -> samples); the order of the mapping does not matter.
 
+    Survey ids sort by the time of upload: that decides which surveys are recent (`out_of_date`).
+
     `progress(fraction, message)` is called often; what it raises (JobCancelled) passes through.
     Raises InvalidInput when there is too little to fit or the parameters make no map, IncompatibleFrames when a walk
     cannot give `spec.components`.
@@ -44,13 +48,15 @@ def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _s
     held_out, noise_sd_uT = _held_out(observed, estimate, ambient_uT)
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
-    names = COMPONENT_NAMES[spec.components]
+    names, frame = COMPONENT_NAMES[spec.components], estimate.frame
     return FittedMap(
         grid=_grid(observed, estimate, spec, ambient_uT, noise_sd_uT, correlation_m),
         hyperparameters={"engine": spec.engine} | estimate.hyperparameters,
         score=scored,
         score_reason=None if scored else _score_reason(observed),
         consistency=check_surveys(held_out, names, correlation_m),
+        layers=quality_layers(frame.x_m, frame.y_m, np.array([frame.height_m]), observed, held_out),
+        out_of_date=out_of_date_regions(observed, held_out, sorted(walks), names, correlation_m),
     )
 
 
