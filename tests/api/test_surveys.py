@@ -35,6 +35,14 @@ def test_a_survey_is_received_mapped_and_judged(service: Any, new_floor: NewFloo
     verdict = service.http.get(f"/v1/surveys/{ids[0]}/consistency").json()
     assert verdict["status"] == "consistent", verdict
     assert [c["component"] for c in verdict["components"]] == ["bx", "by", "bz"]
+    assert verdict["change_point"] is None
+    scored = floor_map["score"]
+    assert scored["rmse_vec_ut"] == pytest.approx(sum(rmse**2 for rmse in scored["rmse_ut"]) ** 0.5)
+    assert 0.0 < scored["rmse_of_norm_ut"] <= scored["rmse_vec_ut"]
+    assert len(scored["sharpness_ut"]) == 3
+    quality = service.http.get(f"/v1/maps/{job['map_id']}/quality").json()
+    assert quality["out_of_date"] == []
+    assert quality["score"] == scored
     report = service.http.get(f"/v1/surveys/{ids[0]}/report").json()
     assert report
     samples = service.http.get(f"/v1/surveys/{ids[0]}/samples", params={"limit": 10}).json()
