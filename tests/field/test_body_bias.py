@@ -1,5 +1,7 @@
 """The offset of one survey that turns: known offsets on a known field, a dense process as second opinion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from app.field import body_bias
-from app.field.body_bias import estimate_body_bias, remove_body_bias
+from app.field.body_bias import estimate_body_bias, remove_body_bias, without_body_biases
 from app.field.samples import Samples
 
 
@@ -101,3 +103,16 @@ def test_a_walk_without_attitude_or_too_short_has_no_estimate(room):
     assert walk.q_body_to_building is not None
     short = Samples(walk.t_s[few], walk.p_building_m[few], walk.B_uT[few], "building", walk.q_body_to_building[few])
     assert estimate_body_bias(short) is None
+
+
+def test_only_walks_of_no_session_are_corrected_each_by_its_own_offset(room):
+    offsets = {"a": (6.0, -2.0, 0.0), "b": (-9.0, 3.0, 0.0), "labelled": (5.0, 5.0, 0.0), "plain": (5.0, 5.0, 0.0)}
+    walks = {name: turning_walk(room, np.random.default_rng(6), bias) for name, bias in offsets.items()}
+    walks["labelled"] = replace(walks["labelled"], session="one")
+    walks["plain"] = replace(walks["plain"], q_body_to_building=None)
+    corrected, biases = without_body_biases(walks)
+    assert list(corrected) == list(walks)
+    assert sorted(biases) == ["a", "b"]
+    assert corrected["labelled"] is walks["labelled"]
+    assert corrected["plain"] is walks["plain"]
+    assert np.abs(corrected["a"].B_uT - corrected["b"].B_uT).max() < 1.0  # they were up to 16 uT apart
