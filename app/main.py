@@ -10,7 +10,7 @@ from fastapi.responses import RedirectResponse
 from threadpoolctl import threadpool_limits
 
 from app import __version__
-from app.api import buildings, health, jobs, locate, maps, surveys
+from app.api import buildings, health, jobs, localizability, locate, maps, surveys
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.metrics import Metrics, MetricsMiddleware
@@ -81,7 +81,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
-    for part in (health, buildings, surveys, maps, locate, jobs):
+    for part in (health, buildings, surveys, maps, localizability, locate, jobs):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)

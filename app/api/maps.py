@@ -29,7 +29,7 @@ from app.services.artefacts import layers_from_bytes, samples_from_bytes
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
 
-__all__ = ["MapView", "router"]
+__all__ = ["MapView", "ready_map", "router"]
 
 router = APIRouter(prefix="/v1", tags=["maps"], responses=ERROR_RESPONSES)
 MAX_FIELD_POINTS = 100_000
@@ -268,7 +268,7 @@ def get_export(
     gradient: Annotated[bool, Query(description="also the derivatives with x and y (z where the map knows it)")] = True,
 ) -> Response:
     """Mean, standard deviation, gradient and the layers of the fit, at every height; unmeasured cells are missing."""
-    ready = _ready_map(context, identity, map_id)
+    ready = ready_map(context, identity, map_id)
 
     def file() -> bytes:
         return export_map(ready.grid, format, ready.sha256, ready.stored_layers(context), gradient)
@@ -296,7 +296,7 @@ def get_heatmap(
     """A map's layers follow from its components; an answer to a wrong name lists them."""
     from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it
 
-    ready = _ready_map(context, identity, map_id)
+    ready = ready_map(context, identity, map_id)
     stored = ready.stored_layers(context)
     check_layer(ready.grid, layer, stored)
     k = nearest_height(ready.grid, height_m)
@@ -332,7 +332,7 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
     return immutable(request, shown, page, "text/html")
 
 
-class _ReadyMap(NamedTuple):
+class ReadyMap(NamedTuple):
     grid: FieldGrid
     sha256: str
     layers_sha256: str | None
@@ -347,15 +347,16 @@ class _ReadyMap(NamedTuple):
         return "-".join([self.sha256, *layers, *map(str, parts), __version__])
 
 
-def _ready_map(context: Context, identity: Identity, map_id: str) -> _ReadyMap:
+def ready_map(context: Context, identity: Identity, map_id: str) -> ReadyMap:
+    """A finished map of the caller's. Raises NotFound, Conflict."""
     with context.transaction() as session:
         row = _find_map(session, identity, map_id)
         sha256, layers_sha256, status = row.grid_sha256, row.layers_sha256, row.status
     if sha256 is None:
         raise Conflict(f"map {map_id} is {status}; it has no field yet")
-    return _ReadyMap(context.grids.grid(sha256), sha256, layers_sha256)
+    return ReadyMap(context.grids.grid(sha256), sha256, layers_sha256)
 
 
 def _ready_grid(context: Context, identity: Identity, map_id: str) -> tuple[FieldGrid, str]:
-    ready = _ready_map(context, identity, map_id)
+    ready = ready_map(context, identity, map_id)
     return ready.grid, ready.sha256

@@ -1,10 +1,12 @@
 """How well a window will be located, from the map alone: Fisher information and the Cramer-Rao bound it sets.
 
 A window is a stretch of path whose last point p is asked for. Its readings tell of p, and of nuisances: the heading
-theta of the whole stretch (a vector map also sees the readings turn), the scale epsilon of its displacements, and a
-constant sensor offset b per component. With the exact gradient J of the map's mean, a reading at q from p moves by
-`J (dp + q eps + q' dtheta) - t dtheta - b`, q' and t being q and the mean field turned by +90 degrees. Nuisances are
-eliminated by Schur complements, each under its Gaussian prior. This is the predictive, directional measure that
+theta of the whole stretch (a vector map also sees the readings turn) and a constant sensor offset b per component.
+With the exact gradient J of the map's mean, a reading at q from p moves by `J (dp + q' dtheta + q eps) - t dtheta - b`,
+q' and t being q and the mean field turned by +90 degrees. Heading and offset are eliminated by Schur complements, each
+under its Gaussian prior. The scale eps of the displacements is in error too, but positioning takes it as told: that
+adds what such an error moves the estimate by (a "consider" parameter, Schmidt 1966), so that the figure is what this
+service can reach, not what one that estimates the scale could. It is the predictive, directional measure that
 (Kuevor B30) asks for and that its GLM, which needs the true position, is not.
 
 Errors that stay alike along the path (the map's own, and what surveys showed of every other cause) are worth one
@@ -20,11 +22,19 @@ from numpy.typing import NDArray
 from app.field.grid import FieldGrid
 from app.geometry import Array
 
-__all__ = ["UNKNOWN_HEADING_SD_RAD", "WindowModel", "expected_error_m", "point_information", "window_covariance_m2"]
+__all__ = [
+    "DECORRELATED_SHARE",
+    "UNKNOWN_CORRELATION_M",
+    "UNKNOWN_HEADING_SD_RAD",
+    "WindowModel",
+    "expected_error_m",
+    "point_information",
+    "window_covariance_m2",
+]
 
 UNKNOWN_HEADING_SD_RAD = float(np.pi / np.sqrt(3.0))  # uniform on the circle
 DECORRELATED_SHARE = 0.12
-UNKNOWN_CORRELATION_M = 2.0
+UNKNOWN_CORRELATION_M = 2.0  # what errors of a map are taken to correlate over when a single survey cannot tell
 LEAST_STEP_M = 0.5  # fields of buildings vary over metres: a finer walk over the map tells nothing new
 LEAST_MEASURED_SHARE = 0.5
 DIRECTIONS = 8
@@ -38,7 +48,7 @@ class WindowModel:
     noise_uT           sd of white noise of one reading, per axis; one reading every `spacing_m` walked
     bias_sd_uT         sd of a constant offset per component: 0 calibrated, inf unknown (a demeaned window)
     heading_sd_rad     of the window's frame: 0 known, UNKNOWN_HEADING_SD_RAD unknown
-    scale_sd           relative sd of the displacements' scale
+    scale_sd           relative sd of the displacements' scale, which is not estimated
     """
 
     length_m: float = 10.0
@@ -47,11 +57,6 @@ class WindowModel:
     bias_sd_uT: float = 0.0
     heading_sd_rad: float = UNKNOWN_HEADING_SD_RAD
     scale_sd: float = 0.02
-
-    @property
-    def nuisance_precision(self) -> tuple[float, float]:
-        """Prior precisions of heading and scale."""
-        return _precision(self.heading_sd_rad), _precision(self.scale_sd)
 
 
 def point_information(grid: FieldGrid, layer: int, noise_uT: float) -> Array:
@@ -62,7 +67,7 @@ def point_information(grid: FieldGrid, layer: int, noise_uT: float) -> Array:
 
 
 def window_covariance_m2(grid: FieldGrid, position_m: Array, window: WindowModel) -> Array:
-    """(2, 2) bound on the covariance of the last of positions (n, 2 or 3) along a path; `length_m` is not used.
+    """(2, 2) covariance at best of the last of positions (n, 2 or 3) along a path; `length_m` is not used.
 
     Readings off the measured map count for nothing. Whoever asks knows at least that the device is on the map.
     """
@@ -79,8 +84,10 @@ def window_covariance_m2(grid: FieldGrid, position_m: Array, window: WindowModel
     told = np.einsum("nc,nca->ca", weight, jacobian)
     known = weight.sum(axis=0) + _precision(window.bias_sd_uT)
     information -= np.einsum("ca,cb,c->ab", told, told, 1.0 / np.maximum(known, 1e-300))
-    information += np.diag([*_extent_precision(grid), *window.nuisance_precision])
-    return np.asarray(np.linalg.inv(information)[:2, :2])
+    estimated = information[:3, :3] + np.diag([*_extent_precision(grid), _precision(window.heading_sd_rad)])
+    covariance = np.linalg.inv(estimated)
+    moved = (covariance @ information[:3, 3])[:2] * window.scale_sd
+    return np.asarray(covariance[:2, :2] + np.outer(moved, moved))
 
 
 def expected_error_m(grid: FieldGrid, layer: int, window: WindowModel) -> Array:
@@ -99,10 +106,11 @@ def expected_error_m(grid: FieldGrid, layer: int, window: WindowModel) -> Array:
     angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     from_last_m = -behind_m[None, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
     cells = np.rint(from_last_m[..., ::-1] / step_m).astype(np.int64)
-    prior = np.array([*_extent_precision(grid), *window.nuisance_precision])
+    prior = np.array([*_extent_precision(grid), 0.0, _precision(window.heading_sd_rad)])
     error = _expected_error(
-        slope, _turn(mean, grid), weight, measured, cells, from_last_m, prior, _precision(window.bias_sd_uT)
-    )
+        slope, _turn(mean, grid), weight, measured, cells, from_last_m, prior, _precision(window.bias_sd_uT),
+        window.scale_sd,
+    )  # fmt: skip
     ny, nx = grid.measured.shape[1:]
     whole = np.repeat(np.repeat(error, stride, axis=0), stride, axis=1)[:ny, :nx]
     return np.asarray(np.where(grid.measured[layer], whole, np.nan))
@@ -139,8 +147,8 @@ def _precision(sd: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bias_precision):  # type: ignore[no-untyped-def]
-    """(ny, nx) rms over directions of the bound, by the formulae of `window_covariance_m2`."""
+def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bias_precision, scale_sd):  # type: ignore[no-untyped-def]
+    """(ny, nx) rms over directions, by the formulae of `window_covariance_m2`; columns: x, y, scale, heading."""
     ny, nx, c = turn.shape
     directions, n, _ = cells.shape
     error = np.full((ny, nx), np.nan)
@@ -161,7 +169,7 @@ def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bi
                     x, y = from_last_m[d, k, 0], from_last_m[d, k, 1]
                     for m in range(c):
                         w, gx, gy = weight[jj, ii, m], slope[jj, ii, m, 0], slope[jj, ii, m, 1]
-                        row[0], row[1], row[2], row[3] = gx, gy, gy * x - gx * y - turn[jj, ii, m], gx * x + gy * y
+                        row[0], row[1], row[2], row[3] = gx, gy, gx * x + gy * y, gy * x - gx * y - turn[jj, ii, m]
                         known[m] += w
                         for a in range(4):
                             told[m, a] += w * row[a]
@@ -174,12 +182,14 @@ def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bi
                         for m in range(c):
                             information[a, b] -= told[m, a] * told[m, b] / max(known[m], 1e-300)
                     information[a, a] += prior[a]
-                for out in (3, 2):  # eliminate scale, then heading
-                    for a in range(out):
-                        for b in range(a + 1):
-                            information[a, b] -= information[out, a] * information[out, b] / information[out, out]
-                determinant = information[0, 0] * information[1, 1] - information[1, 0] ** 2
-                total += (information[0, 0] + information[1, 1]) / determinant
+                for a in range(3):  # eliminate the heading
+                    for b in range(a + 1):
+                        information[a, b] -= information[3, a] * information[3, b] / information[3, 3]
+                xx, xy, yy = information[0, 0], information[1, 0], information[1, 1]
+                determinant = xx * yy - xy**2
+                by_scale_x = (yy * information[2, 0] - xy * information[2, 1]) / determinant
+                by_scale_y = (xx * information[2, 1] - xy * information[2, 0]) / determinant
+                total += (xx + yy) / determinant + scale_sd**2 * (by_scale_x**2 + by_scale_y**2)
                 judged += 1
             if judged:
                 error[j, i] = np.sqrt(total / judged)

@@ -52,14 +52,16 @@ def gradient_norms(gradient_uT_per_m: Array | NDArray[np.float32]) -> GradientNo
     return GradientNorms(columns[..., 0], columns[..., 1], z, np.asarray(np.linalg.norm(columns, axis=-1)))
 
 
-def best_and_worst_points(grid: FieldGrid) -> tuple[Extreme, Extreme] | None:
-    """r*_max and r*_min: the measured cells of largest and smallest total gradient (Kuevor B26); None if none is."""
-    total = gradient_norms(grid.gradient_uT_per_m).total
-    if not grid.measured.any():
+def best_and_worst_points(grid: FieldGrid, layer: int) -> tuple[Extreme, Extreme] | None:
+    """r*_max and r*_min of a layer: the measured cells of largest and smallest total gradient (Kuevor B26).
+
+    None where nothing is measured.
+    """
+    total, measured = gradient_norms(grid.gradient_uT_per_m[layer]).total, grid.measured[layer]
+    if not measured.any():
         return None
-    best = np.argmax(np.where(grid.measured, total, -np.inf))
-    worst = np.argmin(np.where(grid.measured, total, np.inf))
-    return _extreme(grid, total, int(best)), _extreme(grid, total, int(worst))
+    best, worst = np.argmax(np.where(measured, total, -np.inf)), np.argmin(np.where(measured, total, np.inf))
+    return _extreme(grid, layer, total, int(best)), _extreme(grid, layer, total, int(worst))
 
 
 def glm(
@@ -102,8 +104,8 @@ def _ratio(signal: Array, noise: Array) -> Array:
         return np.asarray(np.where(np.asarray(signal) == 0.0, 0.0, np.divide(signal, noise)))
 
 
-def _extreme(grid: FieldGrid, total: Array, flat: int) -> Extreme:
-    k, j, i = np.unravel_index(flat, total.shape)
+def _extreme(grid: FieldGrid, layer: int, total: Array, flat: int) -> Extreme:
+    j, i = np.unravel_index(flat, total.shape)
     x0, y0 = grid.origin_m
-    position = np.array([x0 + i * grid.resolution_m, y0 + j * grid.resolution_m, grid.heights_m[k]])
-    return Extreme(position, float(total[k, j, i]))
+    position = np.array([x0 + i * grid.resolution_m, y0 + j * grid.resolution_m, grid.heights_m[layer]])
+    return Extreme(position, float(total[j, i]))

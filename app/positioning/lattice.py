@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Fault, InvalidInput
+from app.field.expected_error import DECORRELATED_SHARE, UNKNOWN_CORRELATION_M
 from app.field.samples import Components
 from app.geometry import Array
 from app.positioning.features import window_features
@@ -18,8 +19,6 @@ from app.positioning.window import Window
 __all__ = ["ReducedWindow", "Turned", "effective_samples", "heading_lattice", "reduce_window", "turn_window"]
 
 MIN_HEADINGS, MAX_HEADINGS = 72, 720
-DECORRELATED_SHARE = 0.12
-UNKNOWN_CORRELATION_M = 2.0  # what errors of a map are taken to correlate over when a single survey cannot tell
 MOST_SAMPLES = 200  # of a reduced window: fifty metres at 0.25 m
 LEAST_HEADING_SD_RAD = 1e-4
 _HEADING_PRIOR_SDS = 4.5  # how far a heading prior is searched

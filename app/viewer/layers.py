@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import InvalidInput
+from app.field.expected_error import WindowModel, expected_error_m, point_information
 from app.field.grid import FieldGrid
+from app.field.localizability import gradient_norms
 from app.field.samples import COMPONENT_NAMES, Components
 from app.geometry import Array
 
@@ -49,6 +51,10 @@ LAYERS: dict[str, Layer] = {
     "vertical": Layer("Vertical component (up)", "µT"),
     "sd": Layer("Uncertainty (1 sd, all components)", "µT", "cividis"),
     "gradient": Layer("Gradient along the floor", "µT/m"),
+    "gradient_x": Layer("Gradient along x", "µT/m"),
+    "gradient_y": Layer("Gradient along y", "µT/m"),
+    "information": Layer("Information of one reading of 0.5 µT noise", "1/m²"),
+    "expected_error": Layer("Expected error of a 10 m window (rms)", "m", "cividis"),
     "coverage": Layer("Coverage (surveys within 1 m)", "", "cividis"),
     "conflict": Layer("Conflict (errors of left-out surveys / their stated sd)", "", "magma"),
     "measured": Layer("Measured cells", "", "cividis"),
@@ -59,7 +65,8 @@ STORED_LAYERS = ("coverage", "conflict")  # from the fit, beside the grid: an ol
 def layer_names(components: Components, stored: Collection[str] = ()) -> tuple[str, ...]:
     """The layers a map of these components has, with those `stored` beside its grid."""
     own = () if components == "norm" else COMPONENT_NAMES[components]
-    return ("norm", *own, "sd", "gradient", *(name for name in STORED_LAYERS if name in stored), "measured")
+    told = ("gradient", "gradient_x", "gradient_y", "information", "expected_error")
+    return ("norm", *own, "sd", *told, *(name for name in STORED_LAYERS if name in stored), "measured")
 
 
 def nearest_height(grid: FieldGrid, height_m: float | None) -> int:
@@ -81,7 +88,8 @@ def layer_values(grid: FieldGrid, layer: str, height_index: int = 0, stored: Sto
     """One layer at one height: (ny, nx), NaN where nothing was measured ("measured" itself: 1 and 0, never NaN).
 
     norm is the magnitude of the mean field; sd the root of the summed variances of the components; gradient the
-    Frobenius norm of the derivative with x and y. Raises InvalidInput naming the layers, or heights, of this map.
+    Frobenius norm of the derivative with x and y; information and expected_error those of `WindowModel()`, the latter
+    NaN too where no window that ends there is mapped. Raises InvalidInput naming the layers, or heights, of this map.
     """
     check_layer(grid, layer, stored)
     if not 0 <= height_index < len(grid.heights_m):
@@ -99,9 +107,13 @@ def _raw_values(grid: FieldGrid, layer: str, k: int) -> Array:
         return np.asarray(np.linalg.norm(grid.mean_uT[k].astype(np.float64), axis=-1))
     if layer == "sd":
         return np.asarray(np.linalg.norm(grid.sd_uT[k].astype(np.float64), axis=-1))
-    if layer == "gradient":
-        along = grid.gradient_uT_per_m[k, ..., :2]  # a third column, where there is one, is with height
-        return np.asarray(np.sqrt(np.square(along, dtype=np.float64).sum(axis=(-2, -1))))
+    if layer.startswith("gradient"):
+        along = gradient_norms(grid.gradient_uT_per_m[k, ..., :2])  # a third column, where there is one, is with height
+        return {"gradient": along.total, "gradient_x": along.x, "gradient_y": along.y}[layer]
+    if layer == "information":
+        return point_information(grid, k, WindowModel().noise_uT)
+    if layer == "expected_error":
+        return expected_error_m(grid, k, WindowModel())
     return np.asarray(grid.mean_uT[k, ..., grid.component_names.index(layer)].astype(np.float64))
 
 

@@ -37,20 +37,21 @@ def test_column_norms_and_their_total_are_those_published_at_the_worst_point() -
 
 
 @pytest.mark.parametrize("c", [1, 2, 3])
-def test_extremes_are_of_measured_cells_on_any_height(c) -> None:
+def test_extremes_are_of_measured_cells_of_the_layer(c) -> None:
     rng = np.random.default_rng(c)
     gradient, measured = rng.normal(size=(2, 7, 9, c, 2)), rng.random((2, 7, 9)) < 0.5
-    gradient[0, 0, 0], measured[0, 0, 0] = 100.0, False
-    gradient[1, 6, 8], measured[1, 6, 8] = 0.0, False
+    gradient[1, 6, 8], measured[1, 6, 8] = 100.0, False
+    gradient[1, 0, 0], measured[1, 0, 0] = 0.0, False
+    gradient[0, 5, 5], measured[0, 5, 5] = 50.0, True
     gradient[1, 2, 3], measured[1, 2, 3] = 9.0, True
-    gradient[0, 4, 1], measured[0, 4, 1] = 1e-3, True
-    found = best_and_worst_points(grid_with(gradient, measured))
+    gradient[1, 4, 1], measured[1, 4, 1] = 1e-3, True
+    found = best_and_worst_points(grid_with(gradient, measured), 1)
     assert found is not None
     best, worst = found
     np.testing.assert_allclose(best.position_m, [11.5, 21.0, 1.5])
-    np.testing.assert_allclose(worst.position_m, [10.5, 22.0, 1.0])
+    np.testing.assert_allclose(worst.position_m, [10.5, 22.0, 1.5])
     assert best.gradient_uT_per_m == pytest.approx(9.0 * np.sqrt(2 * c))
-    assert best_and_worst_points(grid_with(gradient, np.zeros_like(measured))) is None
+    assert best_and_worst_points(grid_with(gradient, np.zeros_like(measured)), 0) is None
 
 
 def test_glm_is_a_ratio_of_moving_means() -> None:
