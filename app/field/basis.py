@@ -6,7 +6,7 @@ the field to the ambient value. Of all products those within a disc of frequenci
 isotropic field. Products of cosines are sums of cosines, which `app.field.moments` makes use of.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -29,8 +29,31 @@ class CosineBasis:
     functions_per_axis: int
 
     @property
+    def dimensions(self) -> int:
+        return 2
+
+    @property
+    def potential(self) -> bool:
+        return False
+
+    @property
+    def volume(self) -> float:
+        return self.side_m**2
+
+    @property
     def size(self) -> int:
         return len(self.orders)
+
+    @property
+    def rows_per_point(self) -> int:
+        return 1
+
+    def at_origin(self) -> "CosineBasis":
+        return replace(self, corner_m=(0.0, 0.0))
+
+    def rows(self, points_m: Array) -> Array:
+        """(1, n, m) values of all functions at points (n, 2) or (n, 3), whose height is not looked at."""
+        return self.at(points_m)[None]
 
     @property
     def orders(self) -> NDArray[np.int64]:

@@ -14,11 +14,12 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
 
 from app.errors import InvalidInput
-from app.field.estimate import FieldEstimate
-from app.field.kernels import MATERN_SMOOTHNESS, covariance, covariance_slope
+from app.field.estimate import FieldEstimate, ambient_field_uT
+from app.field.kernels import MATERN_SMOOTHNESS, base_kernel, covariance, covariance_slope, is_sum
 from app.field.observations import Walk
-from app.field.raster import GridFrame
-from app.field.spec import Kernel, MapSpec, Progress
+from app.field.raster import GridFrame, layer_heights_m
+from app.field.spec import BaseKernel, MapSpec, Progress
+from app.field.tile_fit import FitState
 from app.geometry import Array
 
 __all__ = ["MAX_OBSERVATIONS", "ExactProcess", "estimate_by_exact", "learn_exact"]
@@ -31,7 +32,7 @@ CELLS_AT_ONCE = 2000
 class ExactProcess:
     """One component's process: kernel, length, signal and noise sd."""
 
-    kernel: Kernel
+    kernel: BaseKernel
     length_m: float
     signal_sd_uT: float
     noise_sd_uT: float
@@ -67,15 +68,15 @@ class ExactPosterior:
         return np.asarray(np.square(self.process.signal_sd_uT) * prior @ self.dual_uT)
 
     def gradient_at(self, points_m: Array) -> Array:
-        """(n, 2) exact derivative of the mean with x and y, uT/m."""
+        """(n, 3) exact derivative of the mean with x, y and z, uT/m."""
         slope = covariance_slope(
             self.process.kernel, _distances_m(points_m, self.position_m), self.process.length_m
         ) * np.square(self.process.signal_sd_uT)
         weighted = slope * self.dual_uT
-        return np.asarray(points_m[:, :2] * weighted.sum(axis=1, keepdims=True) - weighted @ self.position_m[:, :2])
+        return np.asarray(points_m * weighted.sum(axis=1, keepdims=True) - weighted @ self.position_m)
 
 
-def learn_exact(kernel: Kernel, position_m: Array, deviation_uT: Array) -> ExactProcess:
+def learn_exact(kernel: BaseKernel, position_m: Array, deviation_uT: Array) -> ExactProcess:
     """Hyper-parameters of one component by scikit-learn's marginal likelihood (Kuevor B8).
 
     scikit-learn takes seconds to import and only this needs it, so it is imported here.
@@ -98,12 +99,16 @@ def learn_exact(kernel: Kernel, position_m: Array, deviation_uT: Array) -> Exact
 
 
 def estimate_by_exact(
-    walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, height_m: float | None, progress: Progress
+    walks: Sequence[Walk], spec: MapSpec, previous: FitState | None, progress: Progress
 ) -> FieldEstimate:
     """The exact posterior of every component; surveys left out by honest refits at the same hyper-parameters.
 
-    Raises InvalidInput above MAX_OBSERVATIONS.
+    `previous` is not made use of. Raises InvalidInput above MAX_OBSERVATIONS, and for a sum of kernels.
     """
+    kernel = base_kernel(spec.covariance)
+    if is_sum(spec.covariance):
+        raise InvalidInput(f"the exact engine has one length for a kernel: ask for {kernel}, or use engine hilbert")
+    ambient_uT = ambient_field_uT(walks)
     position_m = np.concatenate([walk.position_m for walk in walks])
     deviation_uT = np.concatenate([walk.field_uT for walk in walks]) - ambient_uT
     if len(position_m) > MAX_OBSERVATIONS:
@@ -114,13 +119,15 @@ def estimate_by_exact(
     processes = []
     for component, target in enumerate(deviation_uT.T):
         progress(0.5 * component / len(ambient_uT), f"learning component {component + 1} of {len(ambient_uT)}")
-        processes.append(learn_exact(spec.kernel, position_m, target))
-    frame = GridFrame.around(walks, spec.resolution_m, max(p.length_m for p in processes), height_m)
+        processes.append(learn_exact(kernel, position_m, target))
+    longest_m = max(p.length_m for p in processes)
+    frame = GridFrame.around(walks, spec.resolution_m, longest_m, layer_heights_m(walks, spec))
     posteriors = [p.condition(position_m, y) for p, y in zip(processes, deviation_uT.T, strict=True)]
     mean_uT, variance_ratio, gradient = _on_cells(posteriors, frame, progress)
     held_out = {walk.survey_id: _predict_left_out(walk, walks, processes, ambient_uT) for walk in walks}
     return FieldEstimate(
         frame=frame,
+        ambient_uT=ambient_uT,
         mean_uT=mean_uT,
         variance_ratio=variance_ratio,
         gradient_uT_per_m=gradient,
@@ -129,7 +136,7 @@ def estimate_by_exact(
         held_out_mean_uT={name: mean for name, (mean, _) in held_out.items()},
         held_out_variance_ratio={name: variance for name, (_, variance) in held_out.items()},
         hyperparameters={
-            "kernel": spec.kernel,
+            "kernel": kernel,
             "length_m": [p.length_m for p in processes],
             "signal_sd_ut": [p.signal_sd_uT for p in processes],
             "white_noise_sd_ut": [p.noise_sd_uT for p in processes],
@@ -138,11 +145,11 @@ def estimate_by_exact(
 
 
 def _on_cells(posteriors: Sequence[ExactPosterior], frame: GridFrame, progress: Progress) -> tuple[Array, Array, Array]:
-    """Mean and variance ratio (c, ny, nx), gradient (2, c, ny, nx) at the cell centres, some at a time."""
-    x_m, y_m = np.meshgrid(frame.x_m, frame.y_m)
-    centres_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, frame.height_m)])
+    """Mean and variance ratio (c, nz, ny, nx), gradient (3, c, nz, ny, nx) at the cell centres, some at a time."""
+    z_m, y_m, x_m = np.meshgrid(frame.heights_m, frame.y_m, frame.x_m, indexing="ij")
+    centres_m = np.column_stack([x_m.ravel(), y_m.ravel(), z_m.ravel()])
     mean, variance = np.zeros((2, len(posteriors), len(centres_m)))
-    gradient = np.zeros((2, len(posteriors), len(centres_m)))
+    gradient = np.zeros((3, len(posteriors), len(centres_m)))
     for start in range(0, len(centres_m), CELLS_AT_ONCE):
         progress(0.5 + 0.4 * start / len(centres_m), "predicting the cells of the grid")
         some = slice(start, start + CELLS_AT_ONCE)
@@ -150,7 +157,7 @@ def _on_cells(posteriors: Sequence[ExactPosterior], frame: GridFrame, progress: 
             mean[c, some], variance[c, some] = fitted.at(centres_m[some])
             gradient[:, c, some] = fitted.gradient_at(centres_m[some]).T
     cells = (len(posteriors), *frame.shape)
-    return mean.reshape(cells), variance.reshape(cells), gradient.reshape(2, *cells)
+    return mean.reshape(cells), variance.reshape(cells), gradient.reshape(3, *cells)
 
 
 def _predict_left_out(

@@ -1,6 +1,7 @@
 """Samples in, map out: the one entry of the map engine."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,11 +19,12 @@ from app.field.noise_calibration import noise_sd_by_survey, noise_sd_shown
 from app.field.observations import Walk, observe
 from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import Engine, FittedMap, MapSpec, Progress
+from app.field.tile_fit import FitState
 from app.geometry import Array
 
 __all__ = ["fit_map"]
 
-_Estimator = Callable[[Sequence[Walk], Array, MapSpec, float | None, Progress], FieldEstimate]
+_Estimator = Callable[[Sequence[Walk], MapSpec, FitState | None, Progress], FieldEstimate]
 _ENGINES: dict[Engine, _Estimator] = {"hilbert": estimate_by_hilbert, "exact": estimate_by_exact}
 
 
@@ -30,57 +32,62 @@ def _silent(fraction: float, message: str) -> None:
     """Progress that nobody follows."""
 
 
-def fit_map(walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _silent) -> FittedMap:
+def fit_map(
+    walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _silent, previous: FitState | None = None
+) -> FittedMap:
     """Fit a map from the walks of its surveys (survey id -> samples); the order of the mapping does not matter.
 
     Survey ids sort by the time of upload: that decides which surveys are recent (`out_of_date`).
 
+    `previous` is the state an earlier fit with the same parameters left (FittedMap.state): only tiles whose surveys
+    have changed are fitted again, and the map is what a fit of everything with the same hyper-parameters gives. A survey
+    id must stand for the same samples in both.
     `progress(fraction, message)` is called often; what it raises (JobCancelled) passes through.
     Raises InvalidInput when there is too little to fit or the parameters make no map, IncompatibleFrames when a walk
     cannot give `spec.components`.
     """
-    height_m = _single_height(spec)
+    _check(spec)
     progress(0.0, "reading the walks")
     observed = observe(walks, spec.components)
-    ambient_uT = np.median(np.concatenate([walk.field_uT for walk in observed]), axis=0)
-    estimate = _ENGINES[spec.engine](observed, ambient_uT, spec, height_m, lambda f, text: progress(0.9 * f, text))
+    estimate = _ENGINES[spec.engine](observed, spec, previous, lambda f, text: progress(0.9 * f, text))
     progress(0.9, "scoring the map by leaving each survey out")
-    held_out, noise_sd_uT = _held_out(observed, estimate, ambient_uT)
+    held_out, noise_sd_uT = _held_out(observed, estimate)
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
     names, frame = COMPONENT_NAMES[spec.components], estimate.frame
     return FittedMap(
-        grid=_grid(observed, estimate, spec, ambient_uT, noise_sd_uT, correlation_m),
+        grid=_grid(observed, estimate, spec, noise_sd_uT, correlation_m),
         hyperparameters={"engine": spec.engine} | estimate.hyperparameters,
         score=scored,
         score_reason=None if scored else _score_reason(observed),
         consistency=check_surveys(held_out, names, correlation_m),
-        layers=quality_layers(frame.x_m, frame.y_m, np.array([frame.height_m]), observed, held_out),
+        layers=quality_layers(frame.x_m, frame.y_m, frame.heights_m, observed, held_out),
         out_of_date=out_of_date_regions(observed, held_out, sorted(walks), names, correlation_m),
+        state=estimate.state,
+        tiles_refitted=estimate.tiles_refitted,
     )
 
 
-def _single_height(spec: MapSpec) -> float | None:
-    """The one height asked for, or None for the samples' own. Raises InvalidInput."""
+def _check(spec: MapSpec) -> None:
+    """Raises InvalidInput for parameters that make no map."""
     if not spec.resolution_m > 0.0:
         raise InvalidInput(f"resolution_m is {spec.resolution_m:g}: give the side of a cell in metres, above zero")
-    if spec.heights_m is None:
-        return None
-    if len(spec.heights_m) != 1:
-        raise InvalidInput(
-            f"heights_m asks for {len(spec.heights_m)} layers, but surveys at one height say nothing about another: "
-            "give one height or none"
-        )
-    return spec.heights_m[0]
+    heights_m = spec.heights_m
+    if heights_m is not None and (not heights_m or any(b - a < 0.01 for a, b in pairwise(heights_m))):
+        raise InvalidInput("heights_m must be one or more heights in rising order, a centimetre apart at least")
+    if spec.curl_free and spec.components != "vector":
+        raise InvalidInput(f"a {spec.components} map has no curl to be free of: ask for components vector")
+    if spec.curl_free and spec.engine != "hilbert":
+        raise InvalidInput(f"the {spec.engine} engine has independent components: curl_free needs engine hilbert")
 
 
-def _held_out(walks: Sequence[Walk], estimate: FieldEstimate, ambient_uT: Array) -> tuple[dict[str, HeldOut], Array]:
+def _held_out(walks: Sequence[Walk], estimate: FieldEstimate) -> tuple[dict[str, HeldOut], Array]:
     """Every survey against the map of the others, and the noise sd (c,) of one further measurement."""
-    near = near_other_walks(walks)
+    near = near_other_walks(walks, volume=len(estimate.gradient_uT_per_m) == 3)
     error_uT, latent_uT2, needed_uT2 = {}, {}, {}
     for walk in walks:
         name, stretch = walk.survey_id, walk.stretch_of_sample
-        error_uT[name] = walk.sample_field_uT - (ambient_uT + estimate.held_out_mean_uT[name])[stretch]
+        error_uT[name] = walk.sample_field_uT - (estimate.ambient_uT + estimate.held_out_mean_uT[name])[stretch]
         latent_uT2[name] = (estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT))[stretch]
         needed_uT2[name] = (np.square(error_uT[name]) / 4.0 - latent_uT2[name])[near[name]]
     scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
@@ -99,28 +106,22 @@ def _held_out(walks: Sequence[Walk], estimate: FieldEstimate, ambient_uT: Array)
 
 
 def _grid(
-    walks: Sequence[Walk],
-    estimate: FieldEstimate,
-    spec: MapSpec,
-    ambient_uT: Array,
-    noise_sd_uT: Array,
-    correlation_m: float,
+    walks: Sequence[Walk], estimate: FieldEstimate, spec: MapSpec, noise_sd_uT: Array, correlation_m: float
 ) -> FieldGrid:
-    """One layer of cells, cells first and components last."""
+    """Layers of cells, cells first and components last."""
     frame = estimate.frame
-    sd_uT = np.sqrt(estimate.variance_ratio.transpose(1, 2, 0)) * estimate.prior_sd_uT
-    measured = measured_cells(frame, walks, spec.resolution_m, estimate.variance_ratio.mean(axis=0))
+    sd_uT = np.sqrt(np.moveaxis(estimate.variance_ratio, 0, -1)) * estimate.prior_sd_uT
     return FieldGrid(
         components=spec.components,
         origin_m=(float(frame.x_m[0]), float(frame.y_m[0])),
         resolution_m=spec.resolution_m,
-        heights_m=np.array([frame.height_m]),
-        mean_uT=(estimate.mean_uT.transpose(1, 2, 0) + ambient_uT).astype(np.float32)[None],
-        sd_uT=sd_uT.astype(np.float32)[None],
-        gradient_uT_per_m=np.ascontiguousarray(estimate.gradient_uT_per_m.transpose(2, 3, 1, 0), np.float32)[None],
-        measured=measured[None],
-        ambient_uT=ambient_uT,
-        prior_sd_uT=estimate.prior_sd_uT,
+        heights_m=frame.heights_m,
+        mean_uT=(np.moveaxis(estimate.mean_uT, 0, -1) + estimate.ambient_uT).astype(np.float32),
+        sd_uT=sd_uT.astype(np.float32),
+        gradient_uT_per_m=np.ascontiguousarray(estimate.gradient_uT_per_m.transpose(2, 3, 4, 1, 0), np.float32),
+        measured=measured_cells(frame, walks, spec.resolution_m, estimate),
+        ambient_uT=estimate.ambient_uT,
+        prior_sd_uT=np.ascontiguousarray(estimate.prior_sd_uT),
         noise_sd_uT=noise_sd_uT,
         error_correlation_m=correlation_m,
     )

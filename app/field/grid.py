@@ -20,7 +20,7 @@ Float32 = NDArray[np.float32]
 
 
 class FieldValues(NamedTuple):
-    """The field at points: mean and latent sd (n, c) uT, gradient (n, c, 2) uT/m over x and y, measured (n,)."""
+    """The field at points: mean and latent sd (n, c) uT, gradient (n, c, d) uT/m over x, y (and z), measured (n,)."""
 
     mean_uT: Array
     sd_uT: Array
@@ -31,7 +31,8 @@ class FieldValues(NamedTuple):
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldGrid:
     """mean_uT, sd_uT (nz, ny, nx, c): posterior mean and latent standard deviation of the field
-    gradient_uT_per_m (nz, ny, nx, c, 2): exact derivative of the mean with x and y
+    gradient_uT_per_m (nz, ny, nx, c, d): exact derivative of the mean with x and y (d = 2), and with z (d = 3) where
+        the field was fitted in three dimensions
     measured (nz, ny, nx): cells close enough to samples to be served
     ambient_uT, prior_sd_uT (c,): what the field is taken to be where nothing was measured
     noise_sd_uT (c,): learned sd of one further measurement about the latent field (all error terms together)
@@ -57,7 +58,7 @@ class FieldGrid:
         assert c == len(COMPONENT_NAMES[self.components]), (c, self.components)
         assert self.heights_m.shape == (nz,)
         assert self.sd_uT.shape == (nz, ny, nx, c)
-        assert self.gradient_uT_per_m.shape == (nz, ny, nx, c, 2)
+        assert self.gradient_uT_per_m.shape in ((nz, ny, nx, c, 2), (nz, ny, nx, c, 3))
         assert self.measured.shape == (nz, ny, nx)
         assert self.ambient_uT.shape == self.prior_sd_uT.shape == self.noise_sd_uT.shape == (c,)
 
@@ -94,7 +95,8 @@ class FieldGrid:
         j = np.clip(np.floor(v).astype(np.int64), 0, max(ny - 2, 0))
         fu, fv = np.clip(u - i, 0.0, 1.0), np.clip(v - j, 0.0, 1.0)
         layer, fz = self._layers(p)
-        mean, variance, gradient = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c, 2))
+        mean, variance = np.zeros((2, n, c))
+        gradient = np.zeros((n, *self.gradient_uT_per_m.shape[3:]))
         measured = inside.copy()
         for k, wz in ((layer, 1.0 - fz), (np.minimum(layer + 1, nz - 1), fz)):
             for dj, wv in ((0, 1.0 - fv), (1, fv)):

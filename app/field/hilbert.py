@@ -1,7 +1,8 @@
 """Reduced-rank Gaussian process on one tile: posterior weights, and the field they stand for.
 
-Weights `w ~ N(0, signal^2 S)`; the posterior covariance in units of the signal variance is the same for every
-component, since length and noise ratios are shared: one factor, one variance for all.
+Weights `w ~ N(0, signal^2 S)`. Independent components share length and noise ratios, so one factor of the posterior
+precision and one variance, in units of the signal's, serve them all; components of a potential share the weights
+themselves, and each has a variance of its own.
 """
 
 from dataclasses import dataclass
@@ -12,39 +13,31 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from app.field.basis import CosineBasis
-from app.field.hyperparameters import Hyperparameters
+from app.field.hyperparameters import Basis, Hyperparameters
 from app.field.moments import VarianceSeries, cosines, scaled_functions
+from app.field.slab import SlabBasis
 from app.field.statistics import Evidence
 from app.geometry import Array
 
-__all__ = ["AxisFunctions", "LatticeField", "TilePosterior", "posterior", "predict"]
+__all__ = ["Patch", "PlanePosterior", "SlabPosterior", "posterior", "predict"]
 
 
-class AxisFunctions(NamedTuple):
-    """One axis of a lattice of n points: values and slopes (n, k) of the functions, cosines (n, 2k - 1)."""
+class Patch(NamedTuple):
+    """The field on nz heights, ny rows and nx columns: mean (c, nz, ny, nx) about the ambient, its exact gradient
 
-    values: Array
-    slopes: Array
-    cosines: Array
-
-    @classmethod
-    def at(cls, basis: CosineBasis, axis: int, coordinate_m: Array) -> "AxisFunctions":
-        return cls(
-            basis.along(axis, coordinate_m), basis.slope_along(axis, coordinate_m), cosines(basis, axis, coordinate_m)
-        )
-
-
-class LatticeField(NamedTuple):
-    """On ny rows and nx columns: mean (c, ny, nx) about the ambient, slopes with x and y alike, variance (ny, nx)."""
+    (d, c, nz, ny, nx) over x, y and, of a slab, z; variance over the signal's (v, nz, ny, nx), v = 1 when it is the
+    same for all components. potential_uT_m (nz, ny, nx): whose gradient the mean is, with the opposite sign; None of
+    independent components.
+    """
 
     mean_uT: Array
-    slope_x_uT_per_m: Array
-    slope_y_uT_per_m: Array
+    gradient_uT_per_m: Array
     variance_ratio: Array
+    potential_uT_m: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TilePosterior:
+class PlanePosterior:
     """weights_uT (m, c); variance: of the functions' sum, over the signal variance of each component.
 
     detail_ratio is added to it: the variance of what is too fine for the functions. Never above the prior's.
@@ -56,45 +49,98 @@ class TilePosterior:
     detail_ratio: float
 
     def at(self, points_m: Array) -> tuple[Array, Array]:
-        """Mean about the ambient (n, c) in uT and variance ratio (n,) at points (n, 2)."""
-        return self.basis.at(points_m) @ self.weights_uT, np.minimum(
-            self.variance.at(points_m) + self.detail_ratio, 1.0
+        """Mean about the ambient (n, c) in uT and variance ratio (n, 1) at points (n, 2) or (n, 3)."""
+        variance = np.minimum(self.variance.at(points_m) + self.detail_ratio, 1.0)
+        return self.basis.at(points_m) @ self.weights_uT, variance[:, None]
+
+    def patch(self, x_m: Array, y_m: Array, heights_m: Array) -> Patch:
+        """The field at the crossings of columns and rows, the same at every height."""
+        basis = self.basis
+        by_axis = basis.by_axis(self.weights_uT)
+        x, slope_x = basis.along(0, x_m), basis.slope_along(0, x_m)
+        rows, row_slopes = basis.along(1, y_m) @ by_axis, basis.slope_along(1, y_m) @ by_axis
+        variance = self.variance.on_lattice(cosines(basis, 0, x_m), cosines(basis, 1, y_m)) + self.detail_ratio
+        one = Patch(
+            (rows @ x.T)[:, None],
+            np.stack([rows @ slope_x.T, row_slopes @ x.T])[:, :, None],
+            np.minimum(variance, 1.0)[None, None],
         )
-
-    def on_lattice(self, x: AxisFunctions, y: AxisFunctions) -> LatticeField:
-        """The field at the crossings of columns and rows, axis by axis."""
-        by_axis = self.basis.by_axis(self.weights_uT)
-        rows, row_slopes = y.values @ by_axis, y.slopes @ by_axis
-        variance = np.minimum(self.variance.on_lattice(x.cosines, y.cosines) + self.detail_ratio, 1.0)
-        return LatticeField(rows @ x.values.T, rows @ x.slopes.T, row_slopes @ x.values.T, variance)
+        return Patch(*(np.repeat(values, len(heights_m), axis=-3) for values in one[:3]))
 
 
-def posterior(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> TilePosterior:
+@dataclass(frozen=True, slots=True, eq=False)
+class SlabPosterior:
+    """weights_uT (m, c); factor: of the scaled precision, its lower triangle; root (m,) prior sds of the weights."""
+
+    basis: SlabBasis
+    weights_uT: Array
+    factor: Array
+    root: Array
+    detail_ratio: float
+
+    def at(self, points_m: Array) -> tuple[Array, Array]:
+        """Mean about the ambient (n, c) in uT and variance ratio (n, v) at points (n, 3)."""
+        rows = self.basis.rows(points_m)
+        return _by_point(rows @ self.weights_uT), self._variance(rows).T
+
+    def patch(self, x_m: Array, y_m: Array, heights_m: Array) -> Patch:
+        """The field at the crossings of columns, rows and heights."""
+        sums, mean, gradient = self.basis.on_lattice(self.weights_uT, x_m, y_m, heights_m)
+        y, x = (each.ravel() for each in np.meshgrid(y_m, x_m, indexing="ij"))
+        variance = np.stack(
+            [self._variance(self.basis.rows(np.column_stack([x, y, np.full(len(x), z)]))) for z in heights_m], axis=1
+        )
+        variance = variance.reshape(*variance.shape[:2], len(y_m), len(x_m))
+        return Patch(mean, gradient, variance, sums[0] if self.basis.potential else None)
+
+    def potential_uT_m(self, points_m: Array) -> Array:
+        """(n,) the potential at points (n, 3), but for a constant."""
+        return np.asarray(self.basis.at(points_m) @ self.weights_uT[:, 0])
+
+    def _variance(self, rows: Array) -> Array:
+        """(r, n) for rows (r, n, m)."""
+        r, n, m = rows.shape
+        half = dtrsm(1.0, self.factor, (rows * self.root).reshape(r * n, m).T, lower=1)
+        return np.minimum(np.einsum("mn,mn->n", half, half).reshape(r, n) + self.detail_ratio, 1.0)
+
+
+def posterior(basis: Basis, evidence: Evidence, hyper: Hyperparameters) -> PlanePosterior | SlabPosterior:
     """The posterior of one tile given the sum of its surveys' evidence."""
     root, factor = _factor(basis, evidence, hyper)
     scaled, info = dpotrs(factor, root[:, None] * evidence.target, lower=1)
     assert info == 0, info
+    weights_uT, detail_ratio = root[:, None] * scaled, hyper.detail_ratio(basis)
+    if isinstance(basis, SlabBasis):
+        return SlabPosterior(basis, weights_uT, factor, root, detail_ratio)
     covariance, info = dpotri(factor, lower=1, overwrite_c=1)
     assert info == 0, info
-    variance = VarianceSeries.of(basis, covariance, root)
-    return TilePosterior(basis, root[:, None] * scaled, variance, hyper.detail_ratio(basis))
+    return PlanePosterior(basis, weights_uT, VarianceSeries.of(basis, covariance, root), detail_ratio)
 
 
-def predict(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters, points_m: Array) -> tuple[Array, Array]:
-    """`posterior(...).at(points_m)` for a few points: mean (n, c) about the ambient in uT, variance ratio (n,)."""
+def predict(basis: Basis, evidence: Evidence, hyper: Hyperparameters, points_m: Array) -> tuple[Array, Array]:
+    """`posterior(...).at(points_m)` for a few points: mean (n, c) about the ambient in uT, variance ratio (n, v)."""
     root, factor = _factor(basis, evidence, hyper)
-    components = evidence.target.shape[1]
-    right = np.empty((basis.size, components + len(points_m)), order="F")
-    right[:, :components], right[:, components:] = (
-        root[:, None] * evidence.target,
-        scaled_functions(basis, points_m, root),
-    )
+    if isinstance(basis, SlabBasis):
+        rows = basis.rows(points_m)
+        functions = (rows * root).reshape(-1, basis.size).T
+    else:
+        functions = scaled_functions(basis, points_m, root)
+    targets = evidence.target.shape[1]
+    right = np.empty((basis.size, targets + functions.shape[1]), order="F")
+    right[:, :targets], right[:, targets:] = root[:, None] * evidence.target, functions
     half = dtrsm(1.0, factor, right, lower=1, overwrite_b=1)
-    variance = np.einsum("mn,mn->n", half[:, components:], half[:, components:]) + hyper.detail_ratio(basis)
-    return half[:, components:].T @ half[:, :components], np.minimum(variance, 1.0)
+    variance = np.einsum("mn,mn->n", half[:, targets:], half[:, targets:]) + hyper.detail_ratio(basis)
+    mean = half[:, targets:].T @ half[:, :targets]
+    r = basis.rows_per_point
+    return _by_point(mean.reshape(r, len(points_m), targets)), np.minimum(variance, 1.0).reshape(r, -1).T
 
 
-def _factor(basis: CosineBasis, evidence: Evidence, hyper: Hyperparameters) -> tuple[Array, Array]:
+def _by_point(values: Array) -> Array:
+    """(n, c) of the values (r, n, c') of every row: a potential's three rows are its components."""
+    return np.asarray(values[0] if len(values) == 1 else values[:, :, 0].T)
+
+
+def _factor(basis: Basis, evidence: Evidence, hyper: Hyperparameters) -> tuple[Array, Array]:
     """Prior sds (m,) of the weights, and the Cholesky factor (m, m) of their scaled posterior precision.
 
     Only its lower triangle is meant.

@@ -1,50 +1,106 @@
-"""The default engine: learn on a few tiles, then one pass over all of them, one tile in memory at a time."""
+"""The default engine: learn on a few tiles, then one pass over all of them, one tile in memory at a time.
 
-from collections.abc import Sequence
+A map that has been fitted before leaves what was learned and the fits of its tiles; with the same surveys a tile is
+taken from there. Adding, leaving out or deleting a survey so costs the tiles it crosses.
+"""
 
-from app.field.estimate import FieldEstimate
-from app.field.hilbert import posterior
-from app.field.learning import learn_hyperparameters
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from app.field.estimate import FieldEstimate, ambient_field_uT
+from app.field.learning import learn
 from app.field.leave_one_out import HeldOutPrediction
 from app.field.observations import Walk
-from app.field.raster import BlendedField, GridFrame
+from app.field.potential import blend_potentials
+from app.field.raster import Blended, GridFrame, blend, layer_heights_m
 from app.field.spec import MapSpec, Progress
-from app.field.statistics import add_evidence, marginalise
+from app.field.tile_fit import FitState, Learned, TileFit, fit_tile
 from app.field.tiled_walks import TiledWalks
+from app.field.tiles import Lattice, Tile
 from app.geometry import Array
 
 __all__ = ["estimate_by_hilbert"]
 
+RELEARN = 1.5
+"""What was learned is learned anew when there are this many times more, or fewer, observations."""
+FLAT_M = 0.4
+"""Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
+ROOM_M = 0.5
+"""A slab's heights are rounded outwards to this, so that the next survey fits in."""
+
 
 def estimate_by_hilbert(
-    walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, height_m: float | None, progress: Progress
+    walks: Sequence[Walk], spec: MapSpec, previous: FitState | None, progress: Progress
 ) -> FieldEstimate:
     """The blended field of all tiles, and the walks predicted by subtraction. Raises InvalidInput for a huge grid."""
-    hyper, lattice = learn_hyperparameters(
-        walks, ambient_uT, spec.kernel, lambda f, message: progress(0.4 * f, message)
-    )
-    frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, height_m)
-    blended = BlendedField(lattice, frame, len(ambient_uT))
-    predicted = HeldOutPrediction(lattice, walks, hyper)
-    tiled = TiledWalks(lattice, walks, ambient_uT)
-    tiles = list(tiled.counts())
-    for index, tile in enumerate(tiles):
-        progress(0.4 + 0.6 * index / len(tiles), f"fitting tile {index + 1} of {len(tiles)}")
-        basis = lattice.basis(tile)
-        surveys = tiled.statistics(tile, hyper.walk_noise_in(basis))
-        white_ratio = hyper.white_ratio_in(basis)
-        evidence = {name: marginalise(survey, white_ratio, hyper.bias_ratio) for name, survey in surveys.items()}
-        total = add_evidence(evidence.values())
-        blended.add(tile, posterior(basis, total, hyper))
-        predicted.add(tile, evidence, total)
+    layers_m = layer_heights_m(walks, spec)
+    slab_m = _slab(walks, spec, layers_m)
+    if previous is not None and _still_good(previous.learned, walks, slab_m):
+        learned = previous.learned
+    else:
+        previous = None
+        ambient_uT = ambient_field_uT(walks)
+        learned = learn(walks, ambient_uT, spec, slab_m, lambda f, message: progress(0.4 * f, message))
+    old = previous.tiles if previous is not None and np.array_equal(previous.heights_m, layers_m) else {}
+    lattice, hyper = learned.lattice, learned.hyper
+    frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, layers_m)
+    components = len(learned.ambient_uT)
+    tiled = TiledWalks(lattice, walks, learned.ambient_uT)
+    tiles, count = {}, len(tiled.counts())
+    for index, tile in enumerate(tiled.counts()):
+        tiles[tile] = old.get(tile)
+        if tiles[tile] is None or tiles[tile].surveys != tiled.crossing(tile):
+            progress(0.4 + 0.6 * index / count, f"fitting tile {index + 1} of {count}")
+            tiles[tile] = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m, spec.robust)
+    blended = _blend(lattice, frame, spec, tiles)
+    predicted = HeldOutPrediction(lattice, walks, len(blended.variance_ratio))
+    for tile, fit in tiles.items():
+        predicted.add(tile, tiled.answered(tile), fit.held_out)
+    prior_sd_uT, error_sd_uT = (np.broadcast_to(sd, components) for sd in (hyper.signal_sd_uT, hyper.error_sd_uT))
     return FieldEstimate(
         frame=frame,
+        ambient_uT=learned.ambient_uT,
         mean_uT=blended.mean_uT,
-        variance_ratio=blended.variance_ratio[None],
+        variance_ratio=blended.variance_ratio,
         gradient_uT_per_m=blended.gradient_uT_per_m,
-        prior_sd_uT=hyper.signal_sd_uT,
-        error_sd_uT=hyper.error_sd_uT,
+        prior_sd_uT=prior_sd_uT,
+        error_sd_uT=error_sd_uT,
         held_out_mean_uT=predicted.mean_uT,
-        held_out_variance_ratio={name: ratio[:, None] for name, ratio in predicted.variance_ratio.items()},
+        held_out_variance_ratio=predicted.variance_ratio,
         hyperparameters=hyper.as_json() | {"tile_pitch_m": lattice.pitch_m},
+        state=FitState(learned, layers_m, tiles),
+        tiles_refitted=sum(fit is not old.get(tile) for tile, fit in tiles.items()),
     )
+
+
+def _blend(lattice: Lattice, frame: GridFrame, spec: MapSpec, tiles: Mapping[Tile, TileFit]) -> Blended:
+    patches = {tile: fit.patch for tile, fit in tiles.items()}
+    if not spec.curl_free:
+        return blend(lattice, frame, spec.resolution_m, patches)
+    borders = {tile: fit.borders for tile, fit in tiles.items()}
+    return blend_potentials(lattice, frame, spec.resolution_m, patches, borders)
+
+
+def _slab(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> tuple[float, float] | None:
+    """The heights between which the field is wanted or was measured; None when a plane will do."""
+    z_m = np.concatenate([walk.position_m[:, 2] for walk in walks])
+    low_m, high_m = np.quantile(z_m, [0.05, 0.95])
+    if not spec.curl_free and len(layers_m) == 1 and high_m - low_m < FLAT_M:
+        return None
+    everything = np.append(z_m, layers_m)
+    return (
+        float(np.floor(everything.min() / ROOM_M) * ROOM_M),
+        float(np.ceil(everything.max() / ROOM_M) * ROOM_M),
+    )
+
+
+def _still_good(learned: Learned, walks: Sequence[Walk], slab_m: tuple[float, float] | None) -> bool:
+    """Whether what was learned still serves: about as many observations, within the heights it was made for."""
+    observations = sum(map(len, walks))
+    if not learned.observations / RELEARN <= observations <= learned.observations * RELEARN:
+        return False
+    slab = learned.lattice.slab
+    if slab is None or slab_m is None:
+        return slab is None and slab_m is None
+    return slab.inner_m[0] <= slab_m[0] and slab_m[1] <= slab.inner_m[1]

@@ -1,17 +1,24 @@
-"""The numbers a map is fitted with: one kernel length and one noise shape for all components, one scale for each."""
+"""The numbers a map is fitted with: kernel lengths and one noise shape for all components, one scale for each."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
 from app.field.basis import CosineBasis
-from app.field.kernels import spectral_density, variance_beyond
+from app.field.kernels import Term, base_kernel, spectral_density, variance_beyond
+from app.field.slab import SlabBasis
 from app.field.spec import Kernel
 from app.field.walk_noise import WHITE, WalkNoise
 from app.geometry import Array
 
-__all__ = ["Hyperparameters"]
+__all__ = ["Basis", "Hyperparameters", "weight_variance"]
+
+Basis = CosineBasis | SlabBasis
+
+SOURCE_FREE = 0.05
+"""Sd of the divergence left where somebody walked, over the prior's: labels are off by a little, air is not steel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +27,8 @@ class Hyperparameters:
 
     bias_ratio, walk_ratio, white_ratio: variances of a survey's offset in a tile, of the error correlated along the
     walk and of the white error, over the signal's. r is the distance between places, s the distance walked.
+    short_length_m, short_share: of the second kernel of a sum. noise_scale: survey id -> factor on the variances of its
+    walk and white error; 1 for those not named.
     """
 
     kernel: Kernel
@@ -29,24 +38,56 @@ class Hyperparameters:
     bias_ratio: float = 0.0
     walk_ratio: float = 0.0
     walk_length_m: float = 1.0
+    short_length_m: float | None = None
+    short_share: float = 0.0
+    noise_scale: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        base = base_kernel(self.kernel)
+        if self.short_length_m is None:
+            return (Term(base, self.length_m, 1.0),)
+        return (
+            Term(base, self.length_m, 1.0 - self.short_share),
+            Term(base, self.short_length_m, self.short_share),
+        )
+
+    @property
+    def finest_length_m(self) -> float:
+        """The length that the functions of a tile must follow."""
+        return self.length_m if self.short_length_m is None else self.short_length_m
 
     @property
     def error_sd_uT(self) -> Array:
         """(c,) sd of one observation about the latent field: offset, correlated and white error together."""
         return np.asarray(self.signal_sd_uT * np.sqrt(self.bias_ratio + self.walk_ratio + self.white_ratio))
 
-    def prior_sd(self, basis: CosineBasis) -> Array:
+    def prior_sd(self, basis: Basis) -> Array:
         """(m,) sd of the weight of every function, over the signal's sd."""
-        return _prior_sd(self.kernel, basis.side_m, basis.functions_per_axis, self.length_m)
+        return _prior_sd(self.terms, basis.at_origin())
 
-    def detail_ratio(self, basis: CosineBasis) -> float:
-        """Share of the signal's variance finer than the basis can follow. To the samples it is one more white error."""
-        return variance_beyond(self.kernel, basis.cutoff_rad_per_m, self.length_m)
+    def detail_ratio(self, basis: Basis) -> float:
+        """Share of the signal's variance finer than the basis can follow.
 
-    def white_ratio_in(self, basis: CosineBasis) -> float:
-        return self.white_ratio + self.detail_ratio(basis)
+        A slab is learned on the lattice it is used on, where detail shows as white error: there is no more of it.
+        """
+        tail = sum(
+            share * variance_beyond(kernel, basis.cutoff_rad_per_m, length_m, basis.dimensions, basis.potential)
+            for kernel, length_m, share in self.terms
+        )
+        return min(tail, self.white_ratio) if isinstance(basis, SlabBasis) else tail
 
-    def walk_noise_in(self, basis: CosineBasis) -> WalkNoise:
+    def white_ratio_in(self, basis: Basis, survey_id: str = "") -> float:
+        """Of white error as the functions of a tile see it, detail included."""
+        own = self.white_ratio if isinstance(basis, SlabBasis) else self.white_ratio + self.detail_ratio(basis)
+        return own * self.noise_scale.get(survey_id, 1.0)
+
+    def source_variance_ratio(self, basis: Basis) -> float:
+        """Variance of the divergence allowed in air, over the signal's variance, 1/m^2; only of a potential."""
+        sd = self.prior_sd(basis) * basis.frequencies_squared
+        return float(SOURCE_FREE**2 * np.sum(np.square(sd)) / basis.volume)
+
+    def walk_noise_in(self, basis: Basis) -> WalkNoise:
         """The shape of the errors along a walk as seen by this basis."""
         if self.walk_ratio == 0.0:
             return WHITE
@@ -54,21 +95,36 @@ class Hyperparameters:
 
     def as_json(self) -> dict[str, object]:
         """Plain JSON with units in the names; standard deviations are per component."""
+        short = {}
+        if self.short_length_m is not None:
+            short = {"short_length_m": self.short_length_m, "short_share": self.short_share}
+        scale = {"survey_noise_scale": dict(self.noise_scale)} if self.noise_scale else {}
         return {
             "kernel": self.kernel,
             "length_m": self.length_m,
+            **short,
             "signal_sd_ut": self.signal_sd_uT.tolist(),
             "white_noise_sd_ut": (self.signal_sd_uT * np.sqrt(self.white_ratio)).tolist(),
             "walk_noise_sd_ut": (self.signal_sd_uT * np.sqrt(self.walk_ratio)).tolist(),
             "walk_noise_length_m": self.walk_length_m,
             "survey_bias_sd_ut": (self.signal_sd_uT * np.sqrt(self.bias_ratio)).tolist(),
+            **scale,
         }
 
 
+def weight_variance(terms: Sequence[Term], basis: Basis) -> Array:
+    """(terms, m) variance of the weight of every function, by term of the kernel, shares included."""
+    return np.stack(
+        [
+            share * spectral_density(kernel, basis.frequencies_squared, length_m, basis.dimensions, basis.potential)
+            for kernel, length_m, share in terms
+        ]
+    )
+
+
 @lru_cache(maxsize=8)
-def _prior_sd(kernel: Kernel, side_m: float, functions_per_axis: int, length_m: float) -> Array:
+def _prior_sd(terms: tuple[Term, ...], basis: Basis) -> Array:
     """The same for all tiles of a lattice, wherever their corner."""
-    basis = CosineBasis((0.0, 0.0), side_m, functions_per_axis)
-    sd = np.sqrt(spectral_density(kernel, basis.frequencies_squared, length_m))
+    sd = np.sqrt(weight_variance(terms, basis).sum(axis=0))
     sd.setflags(write=False)
     return np.asarray(sd)

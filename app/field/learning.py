@@ -11,23 +11,32 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 
 from app.field.hyperparameters import Hyperparameters
-from app.field.marginal_likelihood import START_LOG, TOLERANCE, TileStatistics, learn
+from app.field.marginal_likelihood import START_LOG, TOLERANCE, TileStatistics
+from app.field.marginal_likelihood import learn as most_likely
 from app.field.observations import Walk
-from app.field.spec import Kernel, Progress
+from app.field.spec import Kernel, MapSpec, Progress
+from app.field.tile_fit import Learned
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WHITE, WalkNoise
 from app.geometry import Array
 
-__all__ = ["learn_hyperparameters"]
+__all__ = ["learn"]
 
 LEARNING_TILES = (6, 10)
 """At least and at most; in between, one in `TILES_PER_LEARNING_TILE` of the tiles walked."""
 TILES_PER_LEARNING_TILE = 12
 LEARNING_FUNCTIONS = 15
 ROUNDS = 6
+LEARNING_SLABS = (3, 4)
 LEARNABLE = (8.0, 1.0)
 """A tile can tell lengths between an eighth of its pitch (its functions are no finer) and all of it (its size)."""
+LEARNABLE_IN_SLAB = 4.0
+GOOD_ENOUGH_SLAB = 1.3
+CRAMPED = 1.05
+"""A length this near to the least a lattice can tell would be shorter if it could."""
+START_IN_SLAB_M = 1.0
+"""Boxes have few functions to spare: too coarse ones make a rough field look smooth, too fine ones only cost."""
 LARGE_OFFSET = 0.01
 """Above this share of the signal's variance offsets and correlated errors are worth wide tiles, to be told from it."""
 GOOD_ENOUGH = 1.7
@@ -46,7 +55,7 @@ SMALLEST_STEP = np.log(1.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Learned:
+class _Found:
     """Where one search for length, white noise and offsets ended."""
 
     hyper: Hyperparameters
@@ -55,9 +64,11 @@ class _Learned:
     """Negative log marginal likelihood per observation and component."""
 
     def start_with(self, noise: WalkNoise) -> Array:
-        """The logarithms (3,) to start from with another shape of noise: white and correlated error keep their sum."""
+        """The parameters to start from with another shape of noise: white and correlated error keep their sum."""
         own = self.hyper.walk_ratio / self.hyper.white_ratio
-        return np.asarray(self.log_parameters + np.array([0.0, np.log1p(own) - np.log1p(noise.variance_ratio), 0.0]))
+        start = self.log_parameters.copy()
+        start[1] += np.log1p(own) - np.log1p(noise.variance_ratio)
+        return start
 
 
 class _Learner:
@@ -66,46 +77,61 @@ class _Learner:
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel) -> None:
         self._kernel = kernel
         self._pin_bias = len(walks) == 1
-        self._length_bounds_m = (lattice.pitch_m / LEARNABLE[0], lattice.pitch_m / LEARNABLE[1])
+        finest = LEARNABLE[0] if lattice.slab is None else LEARNABLE_IN_SLAB
+        self._length_bounds_m = (lattice.pitch_m / finest, lattice.pitch_m / LEARNABLE[1])
         self._tiled = TiledWalks(lattice, walks, ambient_uT)
-        self._chosen = _well_walked(self._tiled.counts())
+        self._chosen = _well_walked(self._tiled.counts(), LEARNING_TILES if lattice.slab is None else LEARNING_SLABS)
 
-    def learn(self, noise: WalkNoise, start_log: Array, tolerance: float = TOLERANCE) -> _Learned:
+    def learn(self, noise: WalkNoise, start_log: Array, tolerance: float = TOLERANCE) -> _Found:
         tiles = [
             TileStatistics.of(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise).values())
             for tile in self._chosen
         ]
-        hyper, log_parameters, value = learn(
+        hyper, log_parameters, value = most_likely(
             tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias, tolerance
         )
         count = sum(tile.count for tile in tiles)
-        return _Learned(hyper, log_parameters, value / (count * len(hyper.signal_sd_uT)))
+        return _Found(hyper, log_parameters, value / (count * len(hyper.signal_sd_uT)))
 
 
-def learn_hyperparameters(
-    walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel, progress: Progress
-) -> tuple[Hyperparameters, Lattice]:
-    """Maximum marginal likelihood, and the lattice that suits the length it finds."""
-    lattice = _learning_lattice(kernel, float(np.exp(START_LOG[0])))
-    start_log = START_LOG
+def learn(
+    walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, slab_m: tuple[float, float] | None, progress: Progress
+) -> Learned:
+    """Maximum marginal likelihood, and the lattice that suits the length it finds; slabs between the heights `slab_m`."""
+    kernel = spec.covariance
+
+    def learning_lattice(length_m: float) -> Lattice:
+        if slab_m is not None:
+            return Lattice.of_slabs(kernel, length_m, slab_m, spec.curl_free)
+        return replace(Lattice.for_length(kernel, length_m, wide=True), functions_per_axis=LEARNING_FUNCTIONS)
+
+    start_log = START_LOG.copy()
+    if slab_m is not None:
+        start_log[0] = np.log(START_IN_SLAB_M)
+    lattice = learning_lattice(float(np.exp(start_log[0])))
+    good_enough, finest = (GOOD_ENOUGH, LEARNABLE[0]) if slab_m is None else (GOOD_ENOUGH_SLAB, LEARNABLE_IN_SLAB)
     for turn in range(ROUNDS):
         progress(0.5 * turn / ROUNDS, "learning length and noise")
         learner = _Learner(lattice, walks, ambient_uT, kernel)
-        white = learner.learn(WHITE, start_log)
-        start_log = white.log_parameters
-        suited = _learning_lattice(kernel, white.hyper.length_m)
-        if 1.0 / GOOD_ENOUGH <= suited.pitch_m / lattice.pitch_m <= GOOD_ENOUGH:
+        found = learner.learn(WHITE, start_log)
+        start_log = found.log_parameters
+        suited = learning_lattice(found.hyper.finest_length_m)
+        cramped = found.hyper.finest_length_m < CRAMPED * lattice.pitch_m / finest
+        if not cramped and 1.0 / good_enough <= suited.pitch_m / lattice.pitch_m <= good_enough:
             break
         lattice = suited
-    hyper = _learn_walk_noise(learner, white, progress).hyper
-    return hyper, Lattice.for_length(kernel, hyper.length_m, wide=hyper.bias_ratio + hyper.walk_ratio > LARGE_OFFSET)
+    if spec.noise == "walk":
+        found = _learn_walk_noise(learner, found, progress)
+    hyper = found.hyper
+    if slab_m is not None:
+        lattice = Lattice.of_slabs(kernel, hyper.finest_length_m, slab_m, spec.curl_free)
+    else:
+        wide = hyper.short_length_m is not None or hyper.bias_ratio + hyper.walk_ratio > LARGE_OFFSET
+        lattice = Lattice.for_length(kernel, hyper.finest_length_m, wide)
+    return Learned(hyper, lattice, ambient_uT, sum(map(len, walks)))
 
 
-def _learning_lattice(kernel: Kernel, length_m: float) -> Lattice:
-    return replace(Lattice.for_length(kernel, length_m, wide=True), functions_per_axis=LEARNING_FUNCTIONS)
-
-
-def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) -> _Learned:
+def _learn_walk_noise(learner: _Learner, white: _Found, progress: Progress) -> _Found:
     """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
     rough = [learner.learn(noise, white.start_with(noise), ROUGH_TOLERANCE) for noise in TRIED_FIRST]
     tried, noise = min(zip(rough, TRIED_FIRST, strict=True), key=lambda pair: pair[0].nats)
@@ -132,10 +158,10 @@ def _learn_walk_noise(learner: _Learner, white: _Learned, progress: Progress) ->
     return best
 
 
-def _well_walked(counts: Mapping[Tile, int]) -> list[Tile]:
+def _well_walked(counts: Mapping[Tile, int], least_and_most: tuple[int, int]) -> list[Tile]:
     """Of the tiles in the upper half by number of observations, a few spread evenly over the lattice."""
     by_count = sorted(counts, key=lambda tile: (-counts[tile], tile))
-    wanted = int(np.clip(len(counts) // TILES_PER_LEARNING_TILE, *LEARNING_TILES))
+    wanted = int(np.clip(len(counts) // TILES_PER_LEARNING_TILE, *least_and_most))
     upper = sorted(by_count[: max(wanted, len(by_count) // 2)])
     picks = np.unique(np.linspace(0, len(upper) - 1, wanted).round().astype(int))
     return [upper[pick] for pick in picks]

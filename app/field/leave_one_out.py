@@ -11,11 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from app.field.hilbert import predict
-from app.field.hyperparameters import Hyperparameters
 from app.field.observations import Walk, walk_bounds
 from app.field.spec import Score
-from app.field.statistics import Evidence
+from app.field.tile_fit import HeldOutPart
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
 
@@ -54,13 +52,12 @@ class HeldOut:
 class HeldOutPrediction:
     """Predictions at every walk's observations from the other walks, gathered tile by tile."""
 
-    def __init__(self, lattice: Lattice, walks: Sequence[Walk], hyper: Hyperparameters) -> None:
-        self._lattice, self._hyper = lattice, hyper
-        self._points_m = np.concatenate([walk.position_m[:, :2] for walk in walks])
-        self._answering = lattice.answering(self._points_m)
+    def __init__(self, lattice: Lattice, walks: Sequence[Walk], variances: int) -> None:
+        self._lattice = lattice
+        self._points_m = np.concatenate([walk.position_m for walk in walks])
         self._bounds = dict(zip((walk.survey_id for walk in walks), pairwise(walk_bounds(walks)), strict=True))
         self._mean_uT = np.zeros((len(self._points_m), walks[0].field_uT.shape[1]))
-        self._variance_ratio = np.ones(len(self._points_m))
+        self._variance_ratio = np.ones((len(self._points_m), variances))
 
     @property
     def mean_uT(self) -> dict[str, Array]:
@@ -69,25 +66,17 @@ class HeldOutPrediction:
 
     @property
     def variance_ratio(self) -> dict[str, Array]:
-        """Survey id -> (n,) variance of the latent field over the signal's."""
+        """Survey id -> (n, v) variance of the latent field over the signal's."""
         return {survey_id: self._variance_ratio[start:stop] for survey_id, (start, stop) in self._bounds.items()}
 
-    def add(self, tile: Tile, evidence: Mapping[str, Evidence], total: Evidence) -> None:
-        """Predict the walks that cross this tile, each from the evidence of the others."""
-        answered = self._answering.get(tile)
-        if answered is None or len(evidence) == 1:
-            return
-        basis = self._lattice.basis(tile)
-        x_m, y_m = self._points_m[answered].T
-        weight = self._lattice.weight(0, tile, x_m) * self._lattice.weight(1, tile, y_m)
-        for survey_id, own in evidence.items():
-            start, stop = np.searchsorted(answered, self._bounds[survey_id])
-            if start == stop:
-                continue
-            inside = answered[start:stop]
-            mean_uT, variance_ratio = predict(basis, total - own, self._hyper, self._points_m[inside])
-            self._mean_uT[inside] += weight[start:stop, None] * mean_uT
-            self._variance_ratio[inside] += weight[start:stop] * (variance_ratio - 1.0)
+    def add(self, tile: Tile, answered: Mapping[str, NDArray[np.int64]], parts: Mapping[str, HeldOutPart]) -> None:
+        """What one tile predicts, at the observations (indices among all of them) it answers."""
+        for survey_id, part in parts.items():
+            inside = answered[survey_id]
+            x_m, y_m = self._points_m[inside, :2].T
+            weight = (self._lattice.weight(0, tile, x_m) * self._lattice.weight(1, tile, y_m))[:, None]
+            self._mean_uT[inside] += weight * part.mean_uT
+            self._variance_ratio[inside] += weight * (part.variance_ratio - 1.0)
 
 
 def score(held_out: Mapping[str, HeldOut], measured_uT: Mapping[str, Array]) -> Score | None:

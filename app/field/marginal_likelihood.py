@@ -1,7 +1,8 @@
 """Hyper-parameters by maximum marginal likelihood, from sufficient statistics alone: no pass over samples.
 
 The signal variance of each component is concentrated out (`sigma^2 = y^T C^-1 y / n`), which leaves three parameters
-shared by all components: log length, log white ratio, log bias ratio. One evaluation costs O(m^3) per tile. Detail of
+shared by all components: log length, log white ratio, log bias ratio; and for a sum of two kernels two more: the
+logarithm of the second length over the first, and the logit of its share. One evaluation costs O(m^3) per tile. Detail of
 the field finer than the functions can only be learned as white error, which errs on the side of a larger one.
 Rasmussen & Williams 2006, 5.4.1; statistics as Solin & Sarkka 2020, 3.3.
 """
@@ -13,10 +14,10 @@ import numpy as np
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 from scipy.optimize import minimize
+from scipy.special import expit
 
-from app.field.basis import CosineBasis
-from app.field.hyperparameters import Hyperparameters
-from app.field.kernels import log_spectral_slope, spectral_density
+from app.field.hyperparameters import Basis, Hyperparameters, weight_variance
+from app.field.kernels import is_sum, log_spectral_slope
 from app.field.spec import Kernel
 from app.field.statistics import Gram, SurveyStatistics
 from app.field.walk_noise import WalkNoise
@@ -27,6 +28,9 @@ __all__ = ["Likelihood", "TileStatistics", "learn", "negative_log_likelihood"]
 SCALE_FLOOR_UT2 = 1e-6
 LENGTH_BOUNDS_M = (0.3, 40.0)
 RATIO_BOUNDS_LOG = np.log([(1e-6, 1e2), (1e-8, 1e1)])
+SECOND_BOUNDS = np.array([(np.log(0.15), np.log(0.7)), (-4.0, 2.0)])
+"""Of a sum: log of the second length over the first, and logit of its share of the variance."""
+START_SECOND = np.array([np.log(0.35), -1.5])
 MAX_ITERATIONS = 40
 TOLERANCE = 3e-5
 """Relative gain of an iteration below which the search ends; the objective is the value per observation, about one."""
@@ -38,10 +42,10 @@ class TileStatistics:
     """The sums over the s surveys of one tile that a likelihood needs, and the functions they were projected on.
 
     gram, target (m, c), energy (c,), log_det_shape, count: totals. offsets (m, s), ones (s,), ones_target (s, c):
-    of every survey.
+    of every offset of every survey.
     """
 
-    basis: CosineBasis
+    basis: Basis
     gram: Gram
     target: Array
     energy: Array
@@ -52,7 +56,7 @@ class TileStatistics:
     ones_target: Array
 
     @classmethod
-    def of(cls, basis: CosineBasis, surveys: Collection[SurveyStatistics]) -> "TileStatistics":
+    def of(cls, basis: Basis, surveys: Collection[SurveyStatistics]) -> "TileStatistics":
         one, *_ = surveys
         return cls(
             basis=basis,
@@ -61,15 +65,15 @@ class TileStatistics:
             energy=np.sum([s.energy for s in surveys], axis=0),
             log_det_shape=sum(s.log_det_shape for s in surveys),
             count=sum(s.count for s in surveys),
-            offsets=np.stack([s.offset for s in surveys], axis=1),
-            ones=np.array([s.ones for s in surveys]),
-            ones_target=np.stack([s.ones_target for s in surveys]),
+            offsets=np.hstack([s.offsets for s in surveys]),
+            ones=np.concatenate([s.ones for s in surveys]),
+            ones_target=np.vstack([s.ones_target for s in surveys]),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """value: negative log marginal likelihood; gradient (3,) over log length, log white ratio, log bias ratio."""
+    """value: negative log marginal likelihood; gradient (3,) or (5,) over the parameters, in the order above."""
 
     value: float
     gradient: Array
@@ -78,7 +82,7 @@ class Likelihood:
 
 @dataclass(slots=True)
 class _Terms:
-    """Of one tile or a sum of tiles: energy (c,) `y^T C^-1 y`, log_det of C, and their derivatives (3, c) and (3,)."""
+    """Of one tile or a sum of tiles: energy (c,) `y^T C^-1 y`, log_det of C, and their derivatives (p, c) and (p,)."""
 
     energy: Array
     log_det: float
@@ -89,8 +93,8 @@ class _Terms:
 
 def negative_log_likelihood(tiles: Sequence[TileStatistics], kernel: Kernel, log_parameters: Array) -> Likelihood:
     """Concentrated over the signal variances, summed over tiles and components."""
-    length_m, white_ratio, bias_ratio = np.exp(log_parameters)
-    terms = [_tile_terms(tile, kernel, length_m, white_ratio, bias_ratio) for tile in tiles]
+    hyper = _hyperparameters(kernel, log_parameters)
+    terms = [_tile_terms(tile, hyper) for tile in tiles]
     n = sum(term.count for term in terms)
     energy = np.sum([term.energy for term in terms], axis=0) + n * SCALE_FLOOR_UT2
     components = len(energy)
@@ -117,6 +121,10 @@ def learn(
     lower bound: a single survey's offset is the ambient field's.
     """
     bounds = np.vstack([np.log(length_bounds_m), RATIO_BOUNDS_LOG])
+    if is_sum(kernel):
+        bounds = np.vstack([bounds, SECOND_BOUNDS])
+        if len(start_log) == len(START_LOG):
+            start_log = np.concatenate([start_log, START_SECOND])
     if pin_bias:
         bounds[2, 1] = bounds[2, 0]
 
@@ -136,17 +144,41 @@ def learn(
         options={"maxiter": MAX_ITERATIONS, "ftol": tolerance},
     )
     likelihood = seen[best.x.tobytes()]
-    length_m, white_ratio, bias_ratio = (float(v) for v in np.exp(best.x))
-    scale = np.sqrt(likelihood.signal_variance_uT2)
-    hyper = Hyperparameters(kernel, length_m, scale, white_ratio, bias_ratio)
-    walk_ratio = walk_noise.variance_ratio * white_ratio
+    hyper = replace(_hyperparameters(kernel, best.x), signal_sd_uT=np.sqrt(likelihood.signal_variance_uT2))
+    walk_ratio = walk_noise.variance_ratio * hyper.white_ratio
     return replace(hyper, walk_ratio=walk_ratio, walk_length_m=walk_noise.length_m), best.x, likelihood.value
 
 
-def _tile_terms(tile: TileStatistics, kernel: Kernel, length_m: float, white: float, bias: float) -> _Terms:
+def _hyperparameters(kernel: Kernel, log_parameters: Array) -> Hyperparameters:
+    """Of unit signal variance and white noise, from the parameters of a search."""
+    length_m, white_ratio, bias_ratio = np.exp(log_parameters[:3]).tolist()
+    hyper = Hyperparameters(kernel, length_m, np.ones(1), white_ratio, bias_ratio)
+    if not is_sum(kernel):
+        return hyper
+    log_ratio, logit = log_parameters[3:].tolist()
+    return replace(hyper, short_length_m=length_m * float(np.exp(log_ratio)), short_share=float(expit(logit)))
+
+
+def _log_slopes(hyper: Hyperparameters, basis: Basis) -> Array:
+    """(1, m) or (3, m) derivatives of the log prior variance of the weights with the parameters of the kernel."""
+    by_term = weight_variance(hyper.terms, basis)
+    share = by_term / by_term.sum(axis=0)
+    slopes = np.stack(
+        [
+            log_spectral_slope(kernel, basis.frequencies_squared, length_m, basis.dimensions, basis.potential)
+            for kernel, length_m, _ in hyper.terms
+        ]
+    )
+    both = np.sum(share * slopes, axis=0)
+    if len(share) == 1:
+        return both[None]
+    return np.stack([both, share[1] * slopes[1], share[1] - hyper.short_share])
+
+
+def _tile_terms(tile: TileStatistics, hyper: Hyperparameters) -> _Terms:
     """Energy and log determinant of one tile, with S^(1/2)-scaled weights so that every matrix is I plus something."""
-    frequencies_squared = tile.basis.frequencies_squared
-    root = np.sqrt(spectral_density(kernel, frequencies_squared, length_m))
+    white, bias = hyper.white_ratio, hyper.bias_ratio
+    root = hyper.prior_sd(tile.basis)
     shrink = bias / (white + bias * tile.ones)
     offsets = root[:, None] * tile.offsets
     weighted = shrink[:, None] * tile.ones_target
@@ -167,7 +199,7 @@ def _tile_terms(tile: TileStatistics, kernel: Kernel, length_m: float, white: fl
     own = bias * tile.ones / (white + bias * tile.ones)
     log_det = 2.0 * np.sum(np.log(np.diagonal(factor))) + tile.count * np.log(white) - np.sum(np.log1p(-own))
 
-    slope = log_spectral_slope(kernel, frequencies_squared, length_m)
+    slope, *second = _log_slopes(hyper, tile.basis)
     shrink_slope = shrink * white / (white + bias * tile.ones)
     energy_by_shrink = -np.square(tile.ones_target - offsets.T @ z) / white
     log_det_by_shrink = -np.sum(np.square(inverse @ offsets), axis=0) / white
@@ -175,12 +207,20 @@ def _tile_terms(tile: TileStatistics, kernel: Kernel, length_m: float, white: fl
     return _Terms(
         energy=(energy - explained) / white,
         log_det=float(log_det) + tile.log_det_shape,
-        energy_slope=np.stack([-slope @ np.square(z), -misfit / white - energy_by_bias, energy_by_bias]),
+        energy_slope=np.stack(
+            [
+                -slope @ np.square(z),
+                -misfit / white - energy_by_bias,
+                energy_by_bias,
+                *(-each @ np.square(z) for each in second),
+            ]
+        ),
         log_det_slope=np.array(
             [
                 slope @ (1.0 - variance),
                 tile.count - (len(root) - np.sum(variance)) - np.sum(own) - log_det_by_bias,
                 np.sum(own) + log_det_by_bias,
+                *(each @ (1.0 - variance) for each in second),
             ]
         ),
         count=tile.count,

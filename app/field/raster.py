@@ -1,33 +1,38 @@
 """The cells of a grid, and the blending of tiles into them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import EllipsisType
 from typing import NamedTuple
 
 import numpy as np
 
 from app.errors import InvalidInput
-from app.field.hilbert import AxisFunctions, TilePosterior
+from app.field.hilbert import Patch
 from app.field.observations import Walk
+from app.field.spec import MapSpec
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
 
-__all__ = ["BlendedField", "GridFrame"]
+__all__ = ["Blended", "GridFrame", "blend", "layer_heights_m", "placed", "tile_cells"]
 
 MAX_CELLS = 20_000_000
 MAX_MARGIN_M = 3.0
+TOUCHING_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridFrame:
-    """Centres of the columns (nx,) and rows (ny,) of a grid, on multiples of its resolution."""
+    """Centres of the columns (nx,) and rows (ny,) of a grid, on multiples of its resolution, and its heights (nz,)."""
 
     x_m: Array
     y_m: Array
-    height_m: float
+    heights_m: Array
 
     @classmethod
-    def around(cls, walks: Sequence[Walk], resolution_m: float, length_m: float, height_m: float | None) -> "GridFrame":
+    def around(
+        cls, walks: Sequence[Walk], resolution_m: float, length_m: float, heights_m: Sequence[float]
+    ) -> "GridFrame":
         """The walks' bounding box and one length scale around it, three metres at most.
 
         Raises InvalidInput when that has more than twenty million cells.
@@ -36,74 +41,108 @@ class GridFrame:
         margin_m = min(length_m, MAX_MARGIN_M)
         low = np.floor((position_m[:, :2].min(axis=0) - margin_m) / resolution_m)
         high = np.ceil((position_m[:, :2].max(axis=0) + margin_m) / resolution_m)
-        cells = np.prod(high - low + 1.0)
+        cells = np.prod(high - low + 1.0) * len(heights_m)
         if cells > MAX_CELLS:
             width, depth = (high - low) * resolution_m
+            layers = f", {len(heights_m)} layers," if len(heights_m) > 1 else ""
             raise InvalidInput(
-                f"a map of {width:.0f} x {depth:.0f} m at {resolution_m:g} m has {cells:.2g} cells, more than "
+                f"a map of {width:.0f} x {depth:.0f} m{layers} at {resolution_m:g} m has {cells:.2g} cells, more than "
                 f"{MAX_CELLS}: raise resolution_m, or check the positions of the surveys"
             )
         x_m, y_m = (resolution_m * np.arange(a, b + 1.0) for a, b in zip(low, high, strict=True))
-        return cls(x_m, y_m, float(np.median(position_m[:, 2])) if height_m is None else height_m)
+        return cls(x_m, y_m, np.asarray(heights_m, dtype=np.float64))
 
     @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.y_m), len(self.x_m)
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.heights_m), len(self.y_m), len(self.x_m)
 
 
-class BlendedField:
-    """Tiles added one by one under the partition of unity; where no tile was added the prior remains.
+def layer_heights_m(walks: Sequence[Walk], spec: MapSpec) -> Array:
+    """(nz,) the heights asked for, or the one median height of the observations."""
+    if spec.heights_m is not None:
+        return np.array(spec.heights_m, dtype=np.float64)
+    return np.array([np.median(np.concatenate([walk.position_m[:, 2] for walk in walks]))])
 
-    mean_uT (c, ny, nx) about the ambient field, gradient_uT_per_m (2, c, ny, nx) of the blended mean itself (weights
-    vary too), variance_ratio (ny, nx) over the signal variance: the weighted mean of the tiles' variances, which is
-    never below the variance of the weighted mean.
+
+def tile_cells(lattice: Lattice, axis: int, tile: Tile, resolution_m: float) -> Array:
+    """Centres (n,) of the columns (axis 0) or rows of cells that a tile answers, whatever the grid."""
+    start, stop = lattice.answers_between(axis, tile)
+    first, last = np.ceil(start / resolution_m - 1e-9), np.floor(stop / resolution_m + 1e-9)
+    return np.asarray(resolution_m * np.arange(first, last + 1.0))
+
+
+class Blended(NamedTuple):
+    """mean_uT (c, nz, ny, nx) about the ambient field, gradient_uT_per_m (d, c, nz, ny, nx) of the blended mean itself
+
+    (weights vary too), variance_ratio (v, nz, ny, nx) over the signal variance: the weighted mean of the tiles'
+    variances, which is never below the variance of the weighted mean. Where no tile answers the prior remains.
     """
 
-    def __init__(self, lattice: Lattice, frame: GridFrame, components: int) -> None:
-        self._lattice, self._frame = lattice, frame
-        self._strips: dict[tuple[int, int], _Strip] = {}
-        self.mean_uT = np.zeros((components, *frame.shape))
-        self.gradient_uT_per_m = np.zeros((2, components, *frame.shape))
-        self.variance_ratio = np.ones(frame.shape)
-
-    def add(self, tile: Tile, fitted: TilePosterior) -> None:
-        """Blend one tile in."""
-        x, y = self._strip(0, tile), self._strip(1, tile)
-        if not (len(x.weight) and len(y.weight)):
-            return
-        cells = (slice(None), y.cells, x.cells)
-        wx, wy, dwx, dwy = x.weight, y.weight[:, None], x.weight_slope, y.weight_slope[:, None]
-        values = fitted.on_lattice(x.functions, y.functions)
-        self.mean_uT[cells] += wx * wy * values.mean_uT
-        self.gradient_uT_per_m[0][cells] += wy * (wx * values.slope_x_uT_per_m + dwx * values.mean_uT)
-        self.gradient_uT_per_m[1][cells] += wx * (wy * values.slope_y_uT_per_m + dwy * values.mean_uT)
-        self.variance_ratio[cells[1:]] += wx * wy * (values.variance_ratio - 1.0)
-
-    def _strip(self, axis: int, tile: Tile) -> "_Strip":
-        """What the tiles of one column (axis 0) or row share."""
-        key = (axis, tile[axis])
-        if key not in self._strips:
-            centres_m = self._frame.x_m if axis == 0 else self._frame.y_m
-            self._strips[key] = _Strip.of(self._lattice, axis, tile, centres_m)
-        return self._strips[key]
+    mean_uT: Array
+    gradient_uT_per_m: Array
+    variance_ratio: Array
 
 
-class _Strip(NamedTuple):
-    """The columns (or rows) of cells that a column (or row) of tiles answers, with weights and functions there."""
+def blend(lattice: Lattice, frame: GridFrame, resolution_m: float, patches: Mapping[Tile, Patch]) -> Blended:
+    """The tiles' fields under the partition of unity; `patches` must not be empty."""
+    shape = next(iter(patches.values()))
+    mean = np.zeros((len(shape.mean_uT), *frame.shape))
+    gradient = np.zeros((*shape.gradient_uT_per_m.shape[:2], *frame.shape))
+    variance = np.ones((len(shape.variance_ratio), *frame.shape))
+    for tile, patch in patches.items():
+        p = placed(lattice, frame, resolution_m, tile)
+        own = p.of(patch)
+        mean[p.cells] += p.weight * own.mean_uT
+        gradient[p.cells] += p.weight * own.gradient_uT_per_m
+        for axis in (0, 1):
+            gradient[axis][p.cells] += p.slope[axis] * own.mean_uT
+        variance[p.cells] += p.weight * (own.variance_ratio - 1.0)
+    return Blended(mean, gradient, variance)
 
-    cells: slice
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Where a tile lies in a grid: its cells there, those of its own cells that are, and its weight (ny, nx) on them.
+
+    slope: of the weight over x and over y. curvature: over xx, xy and yy.
+    """
+
+    cells: tuple[EllipsisType, slice, slice]
+    own: tuple[EllipsisType, slice, slice]
     weight: Array
-    weight_slope: Array
-    functions: AxisFunctions
+    slope: tuple[Array, Array]
+    curvature: tuple[Array, Array, Array]
 
-    @classmethod
-    def of(cls, lattice: Lattice, axis: int, tile: Tile, centres_m: Array) -> "_Strip":
-        start, stop = lattice.answers_between(axis, tile)
-        cells = slice(int(np.searchsorted(centres_m, start)), int(np.searchsorted(centres_m, stop, side="right")))
-        inside_m = centres_m[cells]
-        return cls(
-            cells,
-            lattice.weight(axis, tile, inside_m),
-            lattice.weight_slope(axis, tile, inside_m),
-            AxisFunctions.at(lattice.basis(tile), axis, inside_m),
-        )
+    def of(self, patch: Patch) -> Patch:
+        """The part of the tile's patch that lies in the grid."""
+        return Patch(*(None if values is None else values[self.own] for values in patch))
+
+
+def placed(lattice: Lattice, frame: GridFrame, resolution_m: float, tile: Tile) -> Placed:
+    x_m, y_m = (tile_cells(lattice, axis, tile, resolution_m) for axis in (0, 1))
+    columns, own_columns = _overlap(frame.x_m, x_m)
+    rows, own_rows = _overlap(frame.y_m, y_m)
+    wx, sx, cx = (
+        f(0, tile, x_m[own_columns]) for f in (lattice.weight, lattice.weight_slope, lattice.weight_curvature)
+    )
+    wy, sy, cy = (
+        f(1, tile, y_m[own_rows])[:, None] for f in (lattice.weight, lattice.weight_slope, lattice.weight_curvature)
+    )
+    return Placed(
+        (..., rows, columns),
+        (..., own_rows, own_columns),
+        wx * wy,
+        (sx * wy, wx * sy),
+        (cx * wy, sx * sy, wx * cy),
+    )
+
+
+def _overlap(centres_m: Array, own_m: Array) -> tuple[slice, slice]:
+    """Which of the centres are among the tile's own, and which of its own they are; both are runs of the raster."""
+    if not len(own_m):
+        return slice(0, 0), slice(0, 0)
+    first, last = np.searchsorted(centres_m, [own_m[0] - TOUCHING_M, own_m[-1] + TOUCHING_M]).tolist()
+    if first >= last:
+        return slice(0, 0), slice(0, 0)
+    skipped = int(np.searchsorted(own_m, centres_m[first] - TOUCHING_M))
+    return slice(first, last), slice(skipped, skipped + last - first)

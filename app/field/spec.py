@@ -1,8 +1,10 @@
 """What to build: the parameters of a map, and what a fit gives back."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +12,13 @@ from numpy.typing import NDArray
 from app.field.grid import FieldGrid
 from app.field.samples import Components
 
+if TYPE_CHECKING:
+    from app.field.tile_fit import FitState
+
 __all__ = [
     "ChangePoint",
     "ComponentChange",
+    "BaseKernel",
     "ComponentConsistency",
     "ConsistencyReport",
     "FittedMap",
@@ -20,25 +26,51 @@ __all__ = [
     "Kernel",
     "MapSpec",
     "OutOfDateRegion",
+    "Noise",
     "Progress",
     "Score",
     "SegmentConsistency",
 ]
 
 Engine = Literal["hilbert", "exact"]
-Kernel = Literal["squared_exponential", "matern32", "matern52"]
+BaseKernel = Literal["squared_exponential", "matern32", "matern52"]
+Kernel = Literal[
+    "squared_exponential",
+    "matern32",
+    "matern52",
+    "squared_exponential+squared_exponential",
+    "matern32+matern32",
+    "matern52+matern52",
+]
+"""One kernel, or the sum of two of different lengths: a building's sway and its beams."""
+Noise = Literal["walk", "white"]
 Progress = Callable[[float, str], None]  # (fraction 0..1, message); may raise JobCancelled
 
 
 @dataclass(frozen=True, slots=True)
 class MapSpec:
-    """The parameters of a map. `heights_m` None: one layer at the samples' median height."""
+    """The parameters of a map.
+
+    kernel      None: matern32, or for a curl-free map matern52
+    heights_m   heights of the layers, rising; None: one layer at the samples' median height
+    curl_free   the field is the gradient of a potential, and free of sources where somebody walked (vector maps)
+    noise       "walk": errors along a walk may be correlated, as far as the likelihood says; "white": never
+    robust      heavy-tailed (Student) errors: what disagrees with everything near it counts less
+    """
 
     components: Components = "vector"
     engine: Engine = "hilbert"
-    kernel: Kernel = "matern32"
+    kernel: Kernel | None = None
     resolution_m: float = 0.25
     heights_m: tuple[float, ...] | None = None
+    curl_free: bool = False
+    noise: Noise = "walk"
+    robust: bool = False
+
+    @property
+    def covariance(self) -> Kernel:
+        """The kernel to use."""
+        return self.kernel or ("matern52" if self.curl_free else "matern32")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,3 +189,5 @@ class FittedMap:
     consistency: dict[str, ConsistencyReport] = field(default_factory=dict)  # by survey id
     layers: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     out_of_date: tuple[OutOfDateRegion, ...] = ()
+    state: FitState | None = None  # what the next fit with the same parameters can start from
+    tiles_refitted: int = 0

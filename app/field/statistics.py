@@ -4,16 +4,23 @@ With basis rows Phi (n, m), features y (n, c) about the ambient field and the wa
 `Phi^T R^-1 Phi`, `Phi^T R^-1 y`, `Phi^T R^-1 1`, `1^T R^-1 1`, `1^T R^-1 y`, `y^T R^-1 y`, `log det R` and n. A
 survey's constant offset inside the tile, of prior variance `bias_ratio` beside a white variance `white_ratio`, is
 integrated out in closed form afterwards (Sherman-Morrison), so offsets cost nothing and no sample is read again.
+
+Functions of a potential give three rows for a point, one for each component, and one target; a survey then has three
+offsets, whose rows do not overlap. Where somebody walked is air, without poles: the divergence of the field there, zero
+up to a little, is one more row.
 """
 
 from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 
 from app.field.basis import CosineBasis
-from app.field.moments import gram_of_moments, moments_of, scaled_functions
+from app.field.hyperparameters import Basis, Hyperparameters
+from app.field.moments import gram_of_moments, moments_of
+from app.field.slab import SlabBasis
 from app.field.walk_noise import WHITE, WalkNoise, whiten
 from app.geometry import Array
 
@@ -22,30 +29,35 @@ __all__ = ["Evidence", "Gram", "SurveyStatistics", "add_evidence", "marginalise"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gram:
-    """`Phi^T R^-1 Phi`: of white noise by its cosine moments (2k - 1, 2k - 1), else by its entries (m, m)."""
+    """`Phi^T R^-1 Phi`: of white noise in the plane by its cosine moments (2k - 1, 2k - 1), else by its entries."""
 
     table: Array
     of_moments: bool
 
-    def scaled(self, basis: CosineBasis, scale: Array) -> Array:
+    def scaled(self, basis: Basis, scale: Array) -> Array:
         """`diag(scale) Phi^T R^-1 Phi diag(scale)` (m, m): the lower triangle, in Fortran order."""
         if self.of_moments:
+            assert isinstance(basis, CosineBasis)
             return gram_of_moments(basis, self.table, scale)
         return np.asfortranarray(self.table * np.outer(scale, scale))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyStatistics:
-    """gram, target (m, c), offset (m,), ones, ones_target (c,), energy (c,), log_det_shape, count: see above."""
+    """gram, target (m, c), offsets (m, k), ones (k,), ones_target (k, c), energy (c,), log_det_shape, count of rows.
+
+    sources: `D^T D` (m, m) of the rows of the divergence where the survey walked; only of a potential.
+    """
 
     gram: Gram
     target: Array
-    offset: Array
-    ones: float
+    offsets: Array
+    ones: Array
     ones_target: Array
     energy: Array
     log_det_shape: float
     count: int
+    sources: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +69,7 @@ class Evidence:
 
     gram: Gram
     offsets: Array
-    signs: Array
+    signs: NDArray[np.float64]
     target: Array
 
     def __sub__(self, other: "Evidence") -> "Evidence":
@@ -68,7 +80,7 @@ class Evidence:
             self.target - other.target,
         )
 
-    def scaled_precision(self, basis: CosineBasis, scale: Array) -> Array:
+    def scaled_precision(self, basis: Basis, scale: Array) -> Array:
         """`I + diag(scale) precision diag(scale)` (m, m): the lower triangle, in Fortran order."""
         precision = self.gram.scaled(basis, scale)
         offsets = scale[:, None] * self.offsets
@@ -78,32 +90,44 @@ class Evidence:
 
 
 def survey_statistics(
-    basis: CosineBasis, points_m: Array, deviation_uT: Array, path_m: Array, noise: WalkNoise
+    basis: Basis,
+    points_m: Array,
+    deviation_uT: Array,
+    path_m: Array,
+    noise: WalkNoise,
+    white_scale: Array | None = None,
 ) -> SurveyStatistics:
     """The statistics of one walk's observations inside one tile.
 
-    points_m (n, 2); deviation_uT (n, c) features minus the ambient field; path_m (n,) distance walked.
+    points_m (n, 2), or (n, 3) for a slab; deviation_uT (n, c) features minus the ambient field; path_m (n,) distance
+    walked; white_scale (n,) factors on the variance of single observations' white error.
     """
-    if noise == WHITE:
+    if noise == WHITE and white_scale is None and isinstance(basis, CosineBasis):
         return _white_statistics(basis, points_m, deviation_uT)
-    m = basis.size
-    columns = np.empty((len(points_m), m + 1 + deviation_uT.shape[1]))
-    columns[:, :m], columns[:, m], columns[:, m + 1 :] = (
-        scaled_functions(basis, points_m, np.ones(m)).T,
-        1.0,
-        deviation_uT,
-    )
-    white, log_det = whiten(columns, path_m, noise)
-    products = dsyrk(1.0, white.T, lower=1)
+    rows = basis.rows(points_m)
+    r, n, m = rows.shape
+    targets = deviation_uT.shape[1] if r == 1 else 1
+    columns = np.zeros((r, n, m + r + targets))
+    columns[:, :, :m] = rows
+    for component in range(r):
+        columns[component, :, m + component] = 1.0
+        columns[component, :, m + r :] = deviation_uT if r == 1 else deviation_uT[:, component : component + 1]
+    log_det = 0.0
+    if noise != WHITE or white_scale is not None:
+        for component in range(r):
+            columns[component], log_det_of_one = whiten(columns[component], path_m, noise, white_scale)
+            log_det += log_det_of_one
+    products = dsyrk(1.0, columns.reshape(r * n, -1).T, lower=1)
     return SurveyStatistics(
         gram=Gram(products[:m, :m], of_moments=False),
-        target=products[m + 1 :, :m].T,
-        offset=products[m, :m],
-        ones=float(products[m, m]),
-        ones_target=products[m + 1 :, m],
-        energy=np.diagonal(products)[m + 1 :],
+        target=products[m + r :, :m].T,
+        offsets=products[m : m + r, :m].T,
+        ones=np.diagonal(products)[m : m + r].copy(),
+        ones_target=products[m + r :, m : m + r].T,
+        energy=np.diagonal(products)[m + r :].copy(),
         log_det_shape=log_det,
-        count=len(points_m),
+        count=r * n,
+        sources=_sources(basis, points_m),
     )
 
 
@@ -113,13 +137,19 @@ def _white_statistics(basis: CosineBasis, points_m: Array, deviation_uT: Array) 
     return SurveyStatistics(
         gram=Gram(moments, of_moments=True),
         target=target,
-        offset=basis.norms * moments[basis.orders[:, 0], basis.orders[:, 1]],
-        ones=float(len(points_m)),
-        ones_target=deviation_uT.sum(axis=0),
+        offsets=(basis.norms * moments[basis.orders[:, 0], basis.orders[:, 1]])[:, None],
+        ones=np.array([float(len(points_m))]),
+        ones_target=deviation_uT.sum(axis=0)[None],
         energy=np.einsum("nc,nc->c", deviation_uT, deviation_uT),
         log_det_shape=0.0,
         count=len(points_m),
     )
+
+
+def _sources(basis: Basis, points_m: Array) -> Array | None:
+    if not (isinstance(basis, SlabBasis) and basis.potential):
+        return None
+    return np.asarray(dsyrk(1.0, basis.divergence_rows(points_m).T, lower=1))
 
 
 def add_evidence(evidence: Collection[Evidence]) -> Evidence:
@@ -133,13 +163,17 @@ def add_evidence(evidence: Collection[Evidence]) -> Evidence:
     )
 
 
-def marginalise(survey: SurveyStatistics, white_ratio: float, bias_ratio: float) -> Evidence:
-    """The survey's evidence about the weights in units of the signal variance, its offset integrated out."""
-    shrink = bias_ratio / (white_ratio + bias_ratio * survey.ones)
-    target = survey.target - shrink * np.outer(survey.offset, survey.ones_target)
+def marginalise(basis: Basis, survey_id: str, survey: SurveyStatistics, hyper: Hyperparameters) -> Evidence:
+    """The survey's evidence about the weights in units of the signal variance, its offsets integrated out."""
+    white_ratio = hyper.white_ratio_in(basis, survey_id)
+    shrink = hyper.bias_ratio / (white_ratio + hyper.bias_ratio * survey.ones)
+    target = survey.target - (survey.offsets * shrink) @ survey.ones_target
+    table = survey.gram.table / white_ratio
+    if survey.sources is not None:
+        table = table + survey.sources / hyper.source_variance_ratio(basis)
     return Evidence(
-        Gram(survey.gram.table / white_ratio, survey.gram.of_moments),
-        np.sqrt(shrink / white_ratio) * survey.offset[:, None],
-        np.ones(1),
+        Gram(table, survey.gram.of_moments),
+        np.sqrt(shrink / white_ratio) * survey.offsets,
+        np.ones(len(shrink)),
         target / white_ratio,
     )

@@ -2,7 +2,7 @@
 
 Tile (i, j) of a lattice of pitch P has the core `[i P, (i + 1) P] x [j P, (j + 1) P]`, whatever the samples. It is
 fitted from samples within a margin of its core and answers within a smaller overlap; weights fall smoothly from 1 to 0
-across the overlap and sum to 1 everywhere.
+across the overlap and sum to 1 everywhere. Tiles of a lattice with a slab reach from one height to another.
 """
 
 from dataclasses import dataclass
@@ -13,23 +13,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.field.basis import CosineBasis
-from app.field.spec import Kernel
+from app.field.hyperparameters import Basis
+from app.field.kernels import base_kernel
+from app.field.slab import SlabBasis
+from app.field.spec import BaseKernel, Kernel
 from app.geometry import Array
 
-__all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "REACH_M", "Lattice", "Tile"]
+__all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "REACH_M", "Lattice", "Slab", "Tile"]
 
 PITCHES_M = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0, 10.0, 12.5, 16.0, 20.0, 25.0, 32.0, 40.0, 63.0, 100.0)
-PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.5}
-WIDE_PITCH_IN_LENGTHS: dict[Kernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
+PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.5}
+WIDE_PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
 """A rough kernel has detail finer than its length and wants functions packed closer than a smooth one. Small tiles
 cost least; only wide ones can tell a long length, or a survey's offset in the tile, from a large field."""
 MARGIN = 0.3
 OVERLAP = 0.1
-FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 14, "matern32": 15}
-WIDE_FUNCTIONS_PER_AXIS: dict[Kernel, int] = {"squared_exponential": 15, "matern52": 20, "matern32": 23}
+FUNCTIONS_PER_AXIS: dict[BaseKernel, int] = {"squared_exponential": 15, "matern52": 14, "matern32": 15}
+WIDE_FUNCTIONS_PER_AXIS: dict[BaseKernel, int] = {"squared_exponential": 15, "matern52": 20, "matern32": 23}
+
+BORDER_POINTS = 9
 
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
+
+
+class _SlabShape(NamedTuple):
+    """In lengths of the kernel: pitch of the tiles, padding of their boxes sideways and up and down, cutoff."""
+
+    pitch: float
+    padding: float
+    headroom: float
+    cutoff: float
+
+
+_SLABS: dict[BaseKernel, _SlabShape] = {
+    "squared_exponential": _SlabShape(2.5, 0.0, 0.75, 4.5),
+    "matern52": _SlabShape(1.8, 0.0, 0.6, 7.5),
+    "matern32": _SlabShape(1.5, 0.0, 0.5, 10.0),
+}
+_POTENTIAL_SLABS: dict[BaseKernel, _SlabShape] = {
+    "squared_exponential": _SlabShape(2.5, 1.0, 2.0, 4.5),
+    "matern52": _SlabShape(1.8, 0.7, 1.5, 6.5),
+    "matern32": _SlabShape(1.5, 0.6, 1.2, 7.5),
+}
 
 
 class Tile(NamedTuple):
@@ -40,6 +66,20 @@ class Tile(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class Slab:
+    """The boxes of a lattice of slabs, for a field between the heights `inner_m`: `headroom_m` taller on either side,
+
+    `padding_m` wider than their tile on every side.
+    """
+
+    inner_m: tuple[float, float]
+    headroom_m: float
+    padding_m: float
+    cutoff_rad_per_m: float
+    potential: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Lattice:
     """The tiles of one pitch. Margin and overlap are fractions of the pitch on every side of a core."""
 
@@ -47,33 +87,47 @@ class Lattice:
     margin: float = MARGIN
     overlap: float = OVERLAP
     functions_per_axis: int = FUNCTIONS_PER_AXIS["matern32"]
+    slab: Slab | None = None
 
     @classmethod
     def for_length(cls, kernel: Kernel, length_m: float, wide: bool = False) -> "Lattice":
         """The finest lattice whose tiles are wide enough for a kernel of this length."""
         pitch_in_lengths = WIDE_PITCH_IN_LENGTHS if wide else PITCH_IN_LENGTHS
         functions = WIDE_FUNCTIONS_PER_AXIS if wide else FUNCTIONS_PER_AXIS
-        least_m = pitch_in_lengths[kernel] * length_m
-        pitch_m = next((pitch for pitch in PITCHES_M if pitch >= least_m), PITCHES_M[-1])
-        return cls(pitch_m, functions_per_axis=functions[kernel])
+        base = base_kernel(kernel)
+        return cls(_pitch_m(pitch_in_lengths[base] * length_m), functions_per_axis=functions[base])
 
-    def basis(self, tile: Tile) -> CosineBasis:
+    @classmethod
+    def of_slabs(cls, kernel: Kernel, length_m: float, heights_m: tuple[float, float], potential: bool) -> "Lattice":
+        """The same, of boxes for a field between two heights."""
+        shape = (_POTENTIAL_SLABS if potential else _SLABS)[base_kernel(kernel)]
+        slab = Slab(
+            heights_m, shape.headroom * length_m, shape.padding * length_m, shape.cutoff / length_m, potential
+        )
+        return cls(_pitch_m(shape.pitch * length_m), slab=slab)
+
+    def basis(self, tile: Tile) -> Basis:
         """The functions a tile is fitted with, on its core and margin."""
-        corner = tuple((index - self.margin) * self.pitch_m for index in tile)
+        x, y = ((index - self.margin) * self.pitch_m for index in tile)
         side = (1.0 + 2.0 * self.margin) * self.pitch_m
-        return CosineBasis((corner[0], corner[1]), side, self.functions_per_axis)
+        if self.slab is None:
+            return CosineBasis((x, y), side, self.functions_per_axis)
+        s = self.slab
+        low_m, high_m = s.inner_m[0] - s.headroom_m, s.inner_m[1] + s.headroom_m
+        corner = (x - s.padding_m, y - s.padding_m, low_m)
+        return SlabBasis(corner, side + 2.0 * s.padding_m, high_m - low_m, s.cutoff_rad_per_m, s.potential)
 
     def fitting(self, points_m: Array) -> dict[Tile, NDArray[np.int64]]:
-        """Tile -> indices, ascending, of the points (n, 2) it is fitted from."""
-        return self._members(points_m, self.margin)
+        """Tile -> indices, ascending, of the points (n, 2) or (n, 3) it is fitted from."""
+        return self._members(points_m[:, :2], self.margin)
 
     def answering(self, points_m: Array) -> dict[Tile, NDArray[np.int64]]:
-        """Tile -> indices, ascending, of the points (n, 2) at which it has a weight."""
-        return self._members(points_m, self.overlap)
+        """Tile -> indices, ascending, of the points (n, 2) or (n, 3) at which it has a weight."""
+        return self._members(points_m[:, :2], self.overlap)
 
     def reached(self, points_m: Array) -> set[Tile]:
-        """The tiles that answer anywhere within REACH_M of a point (n, 2); the others have no measured cell."""
-        return set(self._members(points_m, min(self.margin, self.overlap + REACH_M / self.pitch_m)))
+        """The tiles that answer anywhere within REACH_M of a point (n, 2 or 3); the others have no measured cell."""
+        return set(self._members(points_m[:, :2], min(self.margin, self.overlap + REACH_M / self.pitch_m)))
 
     def answers_between(self, axis: int, tile: Tile) -> tuple[float, float]:
         """The interval of x (axis 0) or y (axis 1) over which a tile has a weight."""
@@ -90,6 +144,23 @@ class Lattice:
         width = 2.0 * self.overlap * self.pitch_m
         rise = _smooth_step_slope(low) * _smooth_step(high) - _smooth_step(low) * _smooth_step_slope(high)
         return np.asarray(rise / width)
+
+    def weight_curvature(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
+        """Second derivative of `weight`, per square metre."""
+        low, high = self._ramps(axis, tile, coordinate_m)
+        width = 2.0 * self.overlap * self.pitch_m
+        bend = _smooth_step_curvature(low) * _smooth_step(high) + _smooth_step(low) * _smooth_step_curvature(high)
+        return np.asarray((bend - 2.0 * _smooth_step_slope(low) * _smooth_step_slope(high)) / width**2)
+
+    def borders(self, tile: Tile, heights_m: Array) -> Array:
+        """(4 n, 3) points along the left, right, lower and upper border of a core, the same for tiles that share one."""
+        i, j = np.array(tile) * self.pitch_m
+        along = np.linspace(0.0, self.pitch_m, BORDER_POINTS)
+        low, high = np.zeros(BORDER_POINTS), np.full(BORDER_POINTS, self.pitch_m)
+        x = i + np.concatenate([low, high, along, along])
+        y = j + np.concatenate([along, along, low, high])
+        middle_m = 0.5 * (heights_m[0] + heights_m[-1])
+        return np.column_stack([x, y, np.full(len(x), middle_m)])
 
     def _ramps(self, axis: int, tile: Tile, coordinate_m: Array) -> tuple[Array, Array]:
         start, stop = self.answers_between(axis, tile)
@@ -114,6 +185,10 @@ class Lattice:
         return {Tile(*tile[start].tolist()): index[start:stop] for start, stop in pairwise(cuts)}
 
 
+def _pitch_m(least_m: float) -> float:
+    return next((pitch for pitch in PITCHES_M if pitch >= least_m), PITCHES_M[-1])
+
+
 def _smooth_step(t: Array) -> Array:
     """0 to 1 with two continuous derivatives; s(t) + s(1 - t) = 1."""
     return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
@@ -121,3 +196,7 @@ def _smooth_step(t: Array) -> Array:
 
 def _smooth_step_slope(t: Array) -> Array:
     return np.asarray(30.0 * t**2 * (1.0 - t) ** 2)
+
+
+def _smooth_step_curvature(t: Array) -> Array:
+    return np.asarray(60.0 * t * (1.0 - t) * (1.0 - 2.0 * t))

@@ -147,5 +147,5 @@ def _padded(cells: Array, prior: Array) -> Float32:
 
 def _rms_gradient(grid: FieldGrid, layer: int) -> float:
     """Root of the mean squared gradient (summed over components and axes) of the measured cells, uT/m."""
-    steep = grid.gradient_uT_per_m[layer][grid.measured[layer]].astype(np.float64)
+    steep = grid.gradient_uT_per_m[layer][grid.measured[layer]][..., :2].astype(np.float64)
     return float(np.sqrt(np.mean(np.sum(np.square(steep), axis=(1, 2))))) if len(steep) else 0.0

@@ -127,7 +127,7 @@ def _residuals(floor: SearchableFloor, plane: Plane, window: ReducedWindow, pose
     total = values.sd_uT**2 + floor.noise_sd_uT**2
     variance = reduce_variance(values.mean_uT, total, source, target).reshape(shape)
     variance = np.maximum(variance, 1e-6) + window.noise_variance_uT2[:, None]
-    slope = field_jacobian(values.mean_uT, source, target) @ values.gradient_uT_per_m
+    slope = field_jacobian(values.mean_uT, source, target) @ values.gradient_uT_per_m[..., :2]
     slope = slope.reshape(*variance.shape, 2)
     z = np.broadcast_to(window.features_uT, variance.shape).copy()
     turn = np.zeros(variance.shape)

@@ -1,0 +1,43 @@
+"""Heavy-tailed errors: a Student likelihood by iterated weights, tile by tile.
+
+A Student error is a Gaussian one whose variance is drawn anew for every observation. Given the field, the expected
+inverse of that variance is `(nu + 1) / (nu + r^2 / s^2)` (Lange, Little & Taylor 1989), so fits and weights alternate;
+r^2 includes the field's own posterior variance, and what it is compared with all errors of one observation: offset and
+correlated error too, so that a well-modelled drift along the walk is not taken for outliers.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from app.field.hilbert import posterior
+from app.field.hyperparameters import Hyperparameters
+from app.field.statistics import Evidence, add_evidence, marginalise
+from app.field.tiled_walks import TiledWalks
+from app.field.tiles import Tile
+from app.geometry import Array
+
+__all__ = ["FREEDOM", "student_scales"]
+
+FREEDOM = 4.0
+ROUNDS = 3
+
+
+def student_scales(
+    tiled: TiledWalks, tile: Tile, hyper: Hyperparameters, evidence: Mapping[str, Evidence]
+) -> dict[str, Array]:
+    """Survey id -> (n,) factors on the variance of the white error of its observations in the tile; 1 is ordinary."""
+    basis = tiled.lattice.basis(tile)
+    parts = tiled.parts(tile)
+    scales: dict[str, Array] = {}
+    for _ in range(ROUNDS):
+        fitted = posterior(basis, add_evidence(evidence.values()), hyper)
+        for survey_id, part in parts.items():
+            mean_uT, variance_ratio = fitted.at(part.points_m)
+            noise_ratio = hyper.bias_ratio + hyper.walk_ratio + hyper.white_ratio_in(basis, survey_id)
+            squared = np.mean(np.square((part.deviation_uT - mean_uT) / hyper.signal_sd_uT), axis=1)
+            squared = squared + variance_ratio.mean(axis=1)
+            scales[survey_id] = (FREEDOM + squared / noise_ratio) / (FREEDOM + 1.0)
+        statistics = tiled.statistics(tile, hyper.walk_noise_in(basis), scales)
+        evidence = {name: marginalise(basis, name, each, hyper) for name, each in statistics.items()}
+    return scales

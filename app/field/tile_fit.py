@@ -1,0 +1,98 @@
+"""The fit of one tile: its field on the raster, and every survey that crosses it predicted from the others.
+
+It depends on the hyper-parameters and on what the surveys that cross the tile measured in it, and on nothing else: as
+long as those are the same surveys the fit is the same, bit for bit, and need not be made again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from app.field.hilbert import Patch, SlabPosterior, posterior, predict
+from app.field.hyperparameters import Hyperparameters
+from app.field.raster import tile_cells
+from app.field.robust import student_scales
+from app.field.statistics import Evidence, add_evidence, marginalise
+from app.field.tiled_walks import TiledWalks
+from app.field.tiles import Lattice, Tile
+from app.geometry import Array
+
+__all__ = ["FitState", "HeldOutPart", "Learned", "TileFit", "fit_tile"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """What all tiles share: hyper-parameters, the lattice that suits them, the ambient field (c,).
+
+    observations: how many they were learned from.
+    """
+
+    hyper: Hyperparameters
+    lattice: Lattice
+    ambient_uT: Array
+    observations: int
+
+
+class HeldOutPart(NamedTuple):
+    """A survey's observations where a tile answers, from the others: mean (n, c) about the ambient, variance (n, v)."""
+
+    mean_uT: Array
+    variance_ratio: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileFit:
+    """surveys: those the tile was fitted from; patch: the field on the cells it answers; held_out: of every survey
+
+    that something can be said of; borders (2, 4, n): the potential (uT m) along the borders of the core, and the field's
+    variance there over the signal's, to match with the neighbours'; empty when there is no potential.
+    """
+
+    surveys: tuple[str, ...]
+    patch: Patch
+    held_out: Mapping[str, HeldOutPart]
+    borders: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitState:
+    """What a fit leaves behind for the next one with the same parameters."""
+
+    learned: Learned
+    heights_m: Array
+    tiles: Mapping[Tile, TileFit]
+
+
+def fit_tile(
+    tiled: TiledWalks, tile: Tile, learned: Learned, resolution_m: float, heights_m: Array, robust: bool
+) -> TileFit:
+    """Fit one tile from the walks that cross it."""
+    hyper, basis = learned.hyper, learned.lattice.basis(tile)
+    evidence = _evidence(tiled, tile, hyper, None)
+    if robust:
+        scales = student_scales(tiled, tile, hyper, evidence)
+        evidence = _evidence(tiled, tile, hyper, scales)
+    total = add_evidence(evidence.values())
+    x_m, y_m = (tile_cells(learned.lattice, axis, tile, resolution_m) for axis in (0, 1))
+    fitted = posterior(basis, total, hyper)
+    borders = np.zeros((2, 4, 0))
+    if isinstance(fitted, SlabPosterior) and basis.potential:
+        points_m = learned.lattice.borders(tile, heights_m)
+        known = np.stack([fitted.potential_uT_m(points_m), fitted.at(points_m)[1].mean(axis=1)])
+        borders = known.reshape(2, 4, -1)
+    held_out = {}
+    if len(evidence) > 1:
+        for survey_id, inside in tiled.answered(tile).items():
+            others = total - evidence[survey_id]
+            held_out[survey_id] = HeldOutPart(*predict(basis, others, hyper, tiled.points_m[inside]))
+    return TileFit(tuple(evidence), fitted.patch(x_m, y_m, heights_m), held_out, borders)
+
+
+def _evidence(
+    tiled: TiledWalks, tile: Tile, hyper: Hyperparameters, white_scales: Mapping[str, Array] | None
+) -> dict[str, Evidence]:
+    basis = tiled.lattice.basis(tile)
+    surveys = tiled.statistics(tile, hyper.walk_noise_in(basis), white_scales)
+    return {name: marginalise(basis, name, survey, hyper) for name, survey in surveys.items()}
