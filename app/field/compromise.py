@@ -8,11 +8,10 @@ the intermediate map was. Stored together with their posterior covariance they l
 farther apart than half a length scale, mean and variance are the intermediate map's.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from app.field.exact import ExactPosterior, _distances_m
 from app.field.kernels import covariance

@@ -40,8 +40,8 @@ def fit_map(
     Survey ids sort by the time of upload: that decides which surveys are recent (`out_of_date`).
 
     `previous` is the state an earlier fit with the same parameters left (FittedMap.state): only tiles whose surveys
-    have changed are fitted again, and the map is what a fit of everything with the same hyper-parameters gives. A survey
-    id must stand for the same samples in both.
+    have changed are fitted again, and the map is what a fit of everything with the same hyper-parameters gives. An id
+    must stand for the same samples in both.
     `progress(fraction, message)` is called often; what it raises (JobCancelled) passes through.
     Raises InvalidInput when there is too little to fit or the parameters make no map, IncompatibleFrames when a walk
     cannot give `spec.components`.

@@ -81,7 +81,7 @@ class SlabPosterior:
     def at(self, points_m: Array) -> tuple[Array, Array]:
         """Mean about the ambient (n, c) in uT and variance ratio (n, v) at points (n, 3)."""
         rows = self.basis.rows(points_m)
-        return _by_point(rows @ self.weights_uT), self._variance(rows).T
+        return _by_point(rows @ self.weights_uT), np.asarray(self._variance(rows).T)
 
     def patch(self, x_m: Array, y_m: Array, heights_m: Array) -> Patch:
         """The field at the crossings of columns, rows and heights."""
@@ -101,7 +101,7 @@ class SlabPosterior:
         """(r, n) for rows (r, n, m)."""
         r, n, m = rows.shape
         half = dtrsm(1.0, self.factor, (rows * self.root).reshape(r * n, m).T, lower=1)
-        return np.minimum(np.einsum("mn,mn->n", half, half).reshape(r, n) + self.detail_ratio, 1.0)
+        return np.asarray(np.minimum(np.einsum("mn,mn->n", half, half).reshape(r, n) + self.detail_ratio, 1.0))
 
 
 def posterior(basis: Basis, evidence: Evidence, hyper: Hyperparameters) -> PlanePosterior | SlabPosterior:

@@ -26,8 +26,6 @@ RELEARN = 1.5
 """What was learned is learned anew when there are this many times more, or fewer, observations."""
 FLAT_M = 0.4
 """Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
-ROOM_M = 0.5
-"""A slab's heights are rounded outwards to this, so that the next survey fits in."""
 
 
 def estimate_by_hilbert(
@@ -47,12 +45,14 @@ def estimate_by_hilbert(
     frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, layers_m)
     components = len(learned.ambient_uT)
     tiled = TiledWalks(lattice, walks, learned.ambient_uT)
-    tiles, count = {}, len(tiled.counts())
+    tiles: dict[Tile, TileFit] = {}
+    count = len(tiled.counts())
     for index, tile in enumerate(tiled.counts()):
-        tiles[tile] = old.get(tile)
-        if tiles[tile] is None or tiles[tile].surveys != tiled.crossing(tile):
+        fit = old.get(tile)
+        if fit is None or fit.surveys != tiled.crossing(tile):
             progress(0.4 + 0.6 * index / count, f"fitting tile {index + 1} of {count}")
-            tiles[tile] = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m, spec.robust)
+            fit = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m, spec.robust)
+        tiles[tile] = fit
     blended = _blend(lattice, frame, spec, tiles)
     predicted = HeldOutPrediction(lattice, walks, len(blended.variance_ratio))
     for tile, fit in tiles.items():
@@ -89,10 +89,7 @@ def _slab(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> tuple[float,
     if not spec.curl_free and len(layers_m) == 1 and high_m - low_m < FLAT_M:
         return None
     everything = np.append(z_m, layers_m)
-    return (
-        float(np.floor(everything.min() / ROOM_M) * ROOM_M),
-        float(np.ceil(everything.max() / ROOM_M) * ROOM_M),
-    )
+    return float(everything.min()), float(everything.max())
 
 
 def _still_good(learned: Learned, walks: Sequence[Walk], slab_m: tuple[float, float] | None) -> bool:

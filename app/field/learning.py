@@ -97,7 +97,7 @@ class _Learner:
 def learn(
     walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, slab_m: tuple[float, float] | None, progress: Progress
 ) -> Learned:
-    """Maximum marginal likelihood, and the lattice that suits the length it finds; slabs between the heights `slab_m`."""
+    """Maximum marginal likelihood, and the lattice that suits the length found: of slabs between heights `slab_m`."""
     kernel = spec.covariance
 
     def learning_lattice(length_m: float) -> Lattice:

@@ -2,8 +2,8 @@
 
 The signal variance of each component is concentrated out (`sigma^2 = y^T C^-1 y / n`), which leaves three parameters
 shared by all components: log length, log white ratio, log bias ratio; and for a sum of two kernels two more: the
-logarithm of the second length over the first, and the logit of its share. One evaluation costs O(m^3) per tile. Detail of
-the field finer than the functions can only be learned as white error, which errs on the side of a larger one.
+logarithm of the second length over the first, and the logit of its share. One evaluation costs O(m^3) per tile. Detail
+of the field finer than the functions can only be learned as white error, which errs on the side of a larger one.
 Rasmussen & Williams 2006, 5.4.1; statistics as Solin & Sarkka 2020, 3.3.
 """
 
@@ -169,7 +169,7 @@ def _log_slopes(hyper: Hyperparameters, basis: Basis) -> Array:
             for kernel, length_m, _ in hyper.terms
         ]
     )
-    both = np.sum(share * slopes, axis=0)
+    both: Array = np.sum(share * slopes, axis=0)
     if len(share) == 1:
         return both[None]
     return np.stack([both, share[1] * slopes[1], share[1] - hyper.short_share])

@@ -30,9 +30,7 @@ class GridFrame:
     heights_m: Array
 
     @classmethod
-    def around(
-        cls, walks: Sequence[Walk], resolution_m: float, length_m: float, heights_m: Sequence[float]
-    ) -> "GridFrame":
+    def around(cls, walks: Sequence[Walk], resolution_m: float, length_m: float, heights_m: Array) -> "GridFrame":
         """The walks' bounding box and one length scale around it, three metres at most.
 
         Raises InvalidInput when that has more than twenty million cells.
@@ -115,7 +113,9 @@ class Placed:
 
     def of(self, patch: Patch) -> Patch:
         """The part of the tile's patch that lies in the grid."""
-        return Patch(*(None if values is None else values[self.own] for values in patch))
+        mean, gradient, variance, potential = patch
+        inside = self.own
+        return Patch(mean[inside], gradient[inside], variance[inside], None if potential is None else potential[inside])
 
 
 def placed(lattice: Lattice, frame: GridFrame, resolution_m: float, tile: Tile) -> Placed:

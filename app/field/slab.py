@@ -3,8 +3,8 @@
 Functions are products of cosines (Neumann walls, like `app.field.basis`) on a box, all those within a ball of
 frequencies. A field component is their sum; or the functions are of a scalar potential and the field is minus its
 gradient, `B = -grad phi`: then the three components share one set of weights, the field has no curl, and its
-divergence is `-laplace phi`. Walls would force a potential's normal field to zero, so its box is larger than the tile by
-a padding, and taller than the surveys (a thin one is wrong by several uT along the vertical).
+divergence is `-laplace phi`. Walls would force a potential's normal field to zero, so its box is larger than the tile
+by a padding, and taller than the surveys (a thin one is wrong by several uT along the vertical).
 """
 
 from dataclasses import dataclass, replace
@@ -21,13 +21,17 @@ __all__ = ["SlabBasis"]
 
 @dataclass(frozen=True, slots=True)
 class SlabBasis:
-    """Orthonormal functions on a box, `side_m` wide along x and y and `depth_m` along z, with lower `corner_m`."""
+    """Orthonormal functions on a box, `side_m` wide along x and y and `depth_m` along z, with lower `corner_m`.
+
+    air_m: the heights between which people, robots and their sensors move.
+    """
 
     corner_m: tuple[float, float, float]
     side_m: float
     depth_m: float
     cutoff_rad_per_m: float
     potential: bool
+    air_m: tuple[float, float] = (0.0, 0.0)
 
     @property
     def dimensions(self) -> int:
@@ -63,7 +67,7 @@ class SlabBasis:
         """(r, n, m) at points (n, 3): what every weight adds to the field; r is `rows_per_point`."""
         values, slopes, _ = self._along_all(points_m)
         if not self.potential:
-            return self._products(values)[None]
+            return np.asarray(self._products(values)[None])
         return -np.stack([self._products([*values[:k], slopes[k], *values[k + 1 :]]) for k in range(3)])
 
     def divergence_rows(self, points_m: Array) -> Array:
@@ -87,7 +91,7 @@ class SlabBasis:
         def derived(*axes: int) -> Array:
             """(c, nz, ny, nx) of the functions, derived once along each of these axes."""
             chosen = [tables[axis][axes.count(axis)] for axis in range(3)]
-            return np.einsum("wabc,xa,yb,zc->wzyx", table, *chosen, optimize=True)
+            return np.asarray(np.einsum("wabc,xa,yb,zc->wzyx", table, *chosen, optimize=True))
 
         if not self.potential:
             return derived(), derived(), np.stack([derived(axis) for axis in range(3)])
@@ -102,9 +106,7 @@ class SlabBasis:
 
     def _along_all(self, points_m: Array) -> tuple[list[Array], list[Array], list[Array]]:
         tables = [self._along(axis, points_m[:, axis]) for axis in range(3)]
-        values, slopes, curvatures = (
-            [np.ascontiguousarray(table[order].T) for table in tables] for order in range(3)
-        )
+        values, slopes, curvatures = ([np.ascontiguousarray(table[order].T) for table in tables] for order in range(3))
         return values, slopes, curvatures
 
     def _along(self, axis: int, coordinate_m: Array) -> tuple[Array, Array, Array]:

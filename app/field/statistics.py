@@ -24,6 +24,8 @@ from app.field.slab import SlabBasis
 from app.field.walk_noise import WHITE, WalkNoise, whiten
 from app.geometry import Array
 
+AIR_EVERY_M = 0.3
+
 __all__ = ["Evidence", "Gram", "SurveyStatistics", "add_evidence", "marginalise", "survey_statistics"]
 
 
@@ -147,9 +149,14 @@ def _white_statistics(basis: CosineBasis, points_m: Array, deviation_uT: Array) 
 
 
 def _sources(basis: Basis, points_m: Array) -> Array | None:
+    """Somebody who walks is in air from low to high, so heights are taken in turn."""
     if not (isinstance(basis, SlabBasis) and basis.potential):
         return None
-    return np.asarray(dsyrk(1.0, basis.divergence_rows(points_m).T, lower=1))
+    low_m, high_m = basis.air_m
+    levels = 1 + int(np.ceil((high_m - low_m) / AIR_EVERY_M))
+    air_m = points_m.copy()
+    air_m[:, 2] = np.resize(np.linspace(low_m, high_m, levels), len(points_m))
+    return np.asarray(dsyrk(1.0, basis.divergence_rows(air_m).T, lower=1))
 
 
 def add_evidence(evidence: Collection[Evidence]) -> Evidence:

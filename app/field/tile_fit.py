@@ -46,8 +46,8 @@ class HeldOutPart(NamedTuple):
 class TileFit:
     """surveys: those the tile was fitted from; patch: the field on the cells it answers; held_out: of every survey
 
-    that something can be said of; borders (2, 4, n): the potential (uT m) along the borders of the core, and the field's
-    variance there over the signal's, to match with the neighbours'; empty when there is no potential.
+    that something can be said of; borders (2, 4, n): the potential (uT m) along the borders of the core and the
+    field's variance there over the signal's, to match with the neighbours'; empty when there is no potential.
     """
 
     surveys: tuple[str, ...]

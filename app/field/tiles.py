@@ -33,6 +33,9 @@ WIDE_FUNCTIONS_PER_AXIS: dict[BaseKernel, int] = {"squared_exponential": 15, "ma
 
 BORDER_POINTS = 9
 
+ROOM_M = 0.5
+"""The heights of a slab are rounded outwards to this, so that the next survey fits in."""
+
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
 
@@ -69,9 +72,10 @@ class Tile(NamedTuple):
 class Slab:
     """The boxes of a lattice of slabs, for a field between the heights `inner_m`: `headroom_m` taller on either side,
 
-    `padding_m` wider than their tile on every side.
+    `padding_m` wider than their tile on every side. air_m: the heights of surveys and layers, rounded to inner_m.
     """
 
+    air_m: tuple[float, float]
     inner_m: tuple[float, float]
     headroom_m: float
     padding_m: float
@@ -101,8 +105,10 @@ class Lattice:
     def of_slabs(cls, kernel: Kernel, length_m: float, heights_m: tuple[float, float], potential: bool) -> "Lattice":
         """The same, of boxes for a field between two heights."""
         shape = (_POTENTIAL_SLABS if potential else _SLABS)[base_kernel(kernel)]
+        low_m, high_m = heights_m
+        inner_m = (float(np.floor(low_m / ROOM_M) * ROOM_M), float(np.ceil(high_m / ROOM_M) * ROOM_M))
         slab = Slab(
-            heights_m, shape.headroom * length_m, shape.padding * length_m, shape.cutoff / length_m, potential
+            heights_m, inner_m, shape.headroom * length_m, shape.padding * length_m, shape.cutoff / length_m, potential
         )
         return cls(_pitch_m(shape.pitch * length_m), slab=slab)
 
@@ -115,7 +121,7 @@ class Lattice:
         s = self.slab
         low_m, high_m = s.inner_m[0] - s.headroom_m, s.inner_m[1] + s.headroom_m
         corner = (x - s.padding_m, y - s.padding_m, low_m)
-        return SlabBasis(corner, side + 2.0 * s.padding_m, high_m - low_m, s.cutoff_rad_per_m, s.potential)
+        return SlabBasis(corner, side + 2.0 * s.padding_m, high_m - low_m, s.cutoff_rad_per_m, s.potential, s.air_m)
 
     def fitting(self, points_m: Array) -> dict[Tile, NDArray[np.int64]]:
         """Tile -> indices, ascending, of the points (n, 2) or (n, 3) it is fitted from."""
@@ -153,7 +159,7 @@ class Lattice:
         return np.asarray((bend - 2.0 * _smooth_step_slope(low) * _smooth_step_slope(high)) / width**2)
 
     def borders(self, tile: Tile, heights_m: Array) -> Array:
-        """(4 n, 3) points along the left, right, lower and upper border of a core, the same for tiles that share one."""
+        """(4 n, 3) points along the left, right, lower and upper border of a core; tiles that share one share them."""
         i, j = np.array(tile) * self.pitch_m
         along = np.linspace(0.0, self.pitch_m, BORDER_POINTS)
         low, high = np.zeros(BORDER_POINTS), np.full(BORDER_POINTS, self.pitch_m)

@@ -182,8 +182,11 @@ def test_progress_rises_and_a_cancelled_job_stops(walks):
 @pytest.mark.parametrize(
     ("spec", "words"),
     [
-        (MapSpec(heights_m=(0.5, 1.5)), "one height"),
-        (MapSpec(heights_m=()), "one height"),
+        (MapSpec(heights_m=(1.5, 0.5)), "rising order"),
+        (MapSpec(heights_m=()), "one or more heights"),
+        (MapSpec(curl_free=True, components="norm"), "components vector"),
+        (MapSpec(curl_free=True, engine="exact"), "engine hilbert"),
+        (MapSpec(engine="exact", kernel="matern32+matern32"), "one length"),
         (MapSpec(resolution_m=0.0), "resolution_m"),
         (MapSpec(resolution_m=float("nan")), "resolution_m"),
         (MapSpec(resolution_m=0.001), "cells"),

@@ -37,11 +37,19 @@ def test_covariance_slope_is_the_derivative_over_the_distance(kernel):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_variance_beyond_a_cutoff_is_the_integral_of_the_density_there(kernel):
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("potential", [False, True])
+def test_variance_beyond_a_cutoff_is_the_integral_of_the_density_there(kernel, dimensions, potential):
     length, cutoff = 1.4, 2.2
 
     def integrand(w):
-        return w * spectral_density(kernel, np.array(w**2), length) / (2 * np.pi)
+        surface = 2 * np.pi * w if dimensions == 2 else 4 * np.pi * w**2
+        density = spectral_density(kernel, np.array(w**2), length, dimensions, potential)
+        one_component = w**2 / dimensions if potential else 1.0
+        return surface * density * one_component / (2 * np.pi) ** dimensions
 
     below, _ = quad(integrand, 0.0, cutoff)
-    assert variance_beyond(kernel, cutoff, length) == pytest.approx(1.0 - below, abs=1e-9)
+    beyond = variance_beyond(kernel, cutoff, length, dimensions, potential)
+    assert beyond == pytest.approx(1.0 - below, abs=1e-9)
+    above, _ = quad(integrand, cutoff, np.inf, limit=200)
+    assert beyond == pytest.approx(above, abs=1e-6)

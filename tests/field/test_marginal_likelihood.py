@@ -7,6 +7,7 @@ from scipy.stats import multivariate_normal
 from app.field.basis import CosineBasis
 from app.field.kernels import spectral_density
 from app.field.marginal_likelihood import TileStatistics, learn, negative_log_likelihood
+from app.field.slab import SlabBasis
 from app.field.statistics import survey_statistics
 from app.field.walk_noise import WHITE, WalkNoise
 
@@ -74,6 +75,20 @@ def test_gradient_equals_finite_differences(parameters, noise):
         for e in np.eye(3)
     ]
     assert np.allclose(gradient, numeric, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("base", ["squared_exponential", "matern32", "matern52"])
+def test_gradient_of_a_sum_equals_finite_differences_on_a_box_of_a_potential(base):
+    basis = SlabBasis((0.0, 0.0, -1.0), 8.0, 3.0, 2.4, potential=True)
+    data = [(np.column_stack([p, np.full(len(p), 0.2)]), y, path) for p, y, path in walks(NOISE, components=3)]
+    tiles = [TileStatistics.of(basis, [survey_statistics(basis, *walk, NOISE) for walk in data])]
+    at, h = np.array([*np.log([1.8, 0.05, 0.02]), np.log(0.4), -1.0]), 1e-5
+    sums = f"{base}+{base}"
+    numeric = [
+        (negative_log_likelihood(tiles, sums, at + e).value - negative_log_likelihood(tiles, sums, at - e).value) / 2e-5
+        for e in h * np.eye(5)
+    ]
+    assert np.allclose(negative_log_likelihood(tiles, sums, at).gradient, numeric, rtol=1e-5, atol=1e-4)
 
 
 def test_learning_never_ends_below_where_it_started():

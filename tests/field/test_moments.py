@@ -66,5 +66,5 @@ def test_statistics_by_moments_equal_those_of_vanishing_walk_noise(basis):
     ones = np.ones(basis.size)
     lower = [np.tril(s.gram.scaled(basis, ones)) for s in (white, direct)]
     assert np.allclose(*lower, atol=1e-10)
-    for name in ("target", "offset", "ones", "ones_target", "energy", "log_det_shape", "count"):
+    for name in ("target", "offsets", "ones", "ones_target", "energy", "log_det_shape", "count"):
         assert np.allclose(getattr(white, name), getattr(direct, name), atol=1e-10), name

@@ -14,3 +14,8 @@ def test_whitening_equals_the_dense_covariance(noise):
     white, log_det = whiten(columns, path, noise)
     assert np.allclose(white.T @ white, columns.T @ np.linalg.solve(dense, columns), rtol=1e-9)
     assert log_det == pytest.approx(np.linalg.slogdet(dense)[1], abs=1e-8)
+    scale = rng.uniform(0.5, 4.0, 40)
+    dense += np.diag(scale - 1.0)
+    white, log_det = whiten(columns, path, noise, scale)
+    assert np.allclose(white.T @ white, columns.T @ np.linalg.solve(dense, columns), rtol=1e-9)
+    assert log_det == pytest.approx(np.linalg.slogdet(dense)[1], abs=1e-8)
