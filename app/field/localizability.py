@@ -31,7 +31,7 @@ class GradientNorms(NamedTuple):
 
 
 class Extreme(NamedTuple):
-    """A cell centre (3,) and the total gradient there."""
+    """A cell centre (3,) and the total gradient along the floor there."""
 
     position_m: Array
     gradient_uT_per_m: float
@@ -53,11 +53,11 @@ def gradient_norms(gradient_uT_per_m: Array | NDArray[np.float32]) -> GradientNo
 
 
 def best_and_worst_points(grid: FieldGrid, layer: int) -> tuple[Extreme, Extreme] | None:
-    """r*_max and r*_min of a layer: the measured cells of largest and smallest total gradient (Kuevor B26).
+    """r*_max and r*_min of a layer: measured cells of largest and smallest total gradient along the floor (Kuevor B26).
 
     None where nothing is measured.
     """
-    total, measured = gradient_norms(grid.gradient_uT_per_m[layer]).total, grid.measured[layer]
+    total, measured = gradient_norms(grid.gradient_uT_per_m[layer, ..., :2]).total, grid.measured[layer]
     if not measured.any():
         return None
     best, worst = np.argmax(np.where(measured, total, -np.inf)), np.argmin(np.where(measured, total, np.inf))

@@ -17,7 +17,7 @@ Percentiles = dict[str, float]  # "p5" to "p95"
 
 @dataclass(frozen=True, slots=True)
 class JudgedPoint:
-    """A measured cell, its total gradient and the expected error there (None: no window that ends there is mapped)."""
+    """A measured cell, its gradient along the floor, and its expected error (None: no window that ends there is mapped)."""
 
     position_m: tuple[float, float, float]
     gradient_uT_per_m: float
@@ -28,7 +28,7 @@ class JudgedPoint:
 class LocalizabilitySummary:
     """Of the measured cells at one height. Shares are of all of them; cells without an expected error are in none.
 
-    gradient_uT_per_m   percentiles of "total", "x" and "y" (and "z" where the map knows it)
+    gradient_uT_per_m   percentiles of "total" (along the floor), "x" and "y"; empty where nothing is measured
     """
 
     height_m: float
@@ -47,14 +47,14 @@ def summarise_localizability(grid: FieldGrid, height_index: int, window: WindowM
     measured = grid.measured[height_index]
     error_m = expected_error_m(grid, height_index, window)
     judged_m = error_m[np.isfinite(error_m)]
-    norms = gradient_norms(grid.gradient_uT_per_m[height_index])
-    named = {"total": norms.total, "x": norms.x, "y": norms.y, "z": norms.z}
+    norms = gradient_norms(grid.gradient_uT_per_m[height_index, ..., :2])
+    named = {"total": norms.total, "x": norms.x, "y": norms.y}
     extremes = best_and_worst_points(grid, height_index)
     best, worst = (_judge(grid, error_m, point) for point in extremes) if extremes else (None, None)
     return LocalizabilitySummary(
         height_m=float(grid.heights_m[height_index]),
         measured_area_m2=float(measured.sum() * grid.resolution_m**2),
-        gradient_uT_per_m={name: _percentiles(v[measured]) for name, v in named.items() if v is not None and extremes},
+        gradient_uT_per_m={name: _percentiles(v[measured]) for name, v in named.items() if extremes},
         best=best,
         worst=worst,
         expected_error_m=_percentiles(judged_m) if len(judged_m) else None,
