@@ -11,6 +11,7 @@ both tests and all stretches of independent length; a stretch pays for more plac
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
@@ -81,32 +82,54 @@ def _component(name: str, before_uT: Array, after_uT: Array) -> ComponentChange:
 
 
 def _clearest(standardised: Array, first: NDArray[np.intp], cell_m: float, correlation_m: float) -> _Split | None:
-    """The stretch of cells that differs most clearly from the rest; None when the walk is too short to have one."""
+    """The stretch of cells that differs most clearly from the rest; None when none differs by enough to matter."""
     z = np.clip(standardised, -CLIP_SD, CLIP_SD)
     features = np.hstack([z, np.abs(z)])
     samples = np.diff(np.append(first, len(z)))[:, None]
     cells, count = len(first), features.shape[1]
     mean, square = (np.add.reduceat(f, first, axis=0) / samples for f in (features, np.square(features)))
     total = np.vstack([np.zeros(count), np.cumsum(mean, axis=0)])
-    start, stop = np.triu_indices(cells + 1, 1)
-    inside = stop - start
-    shortest = int(np.ceil(max(SHORTEST_M, CORRELATION_LENGTHS * correlation_m) / cell_m))
-    kept = (inside >= shortest) & (cells - inside >= shortest)
-    start, stop, inside = start[kept], stop[kept], inside[kept]
-    if not len(start):
-        return None
-    outside = cells - inside
-    inner = (total[stop] - total[start]) / inside[:, None]
-    outer = (total[-1] - total[stop] + total[start]) / outside[:, None]
-    within = (square.sum(axis=0) - inside[:, None] * inner**2 - outside[:, None] * outer**2) / cells
     least = np.repeat([CALIBRATED_SD, CALIBRATED_MAGNITUDE_SD], count // 2)
     lengths_m = np.repeat([correlation_m, max(correlation_m, LEAST_MAGNITUDE_CORRELATION_M)], count // 2)
-    of_means = 2.0 * lengths_m / cell_m * (1.0 / inside + 1.0 / outside)[:, None]
-    difference = np.abs(inner - outer)
-    statistic = difference / np.sqrt(np.maximum(within, least**2) * of_means)
+    shortest = int(np.ceil(max(SHORTEST_M, CORRELATION_LENGTHS * correlation_m) / cell_m))
     independent = max(2.0, cells * cell_m / (2.0 * correlation_m))
-    places = np.where((start == 0) | (stop == cells), independent, independent**2 / 2.0)
-    log_p = log_ndtr(-statistic) + np.log(2.0 * count * places)[:, None]
-    log_p = np.where(difference >= LEAST_CHANGE, np.minimum(log_p, 0.0), 0.0)
-    best = int(np.argmin(log_p.min(axis=1)))
-    return _Split(int(start[best]), int(stop[best]), log_p[best])
+    clearest = None
+    for switch, places in ((True, independent), (False, independent**2 / 2.0)):
+        arguments = square.sum(axis=0), np.square(least), 2.0 * lengths_m / cell_m, shortest, switch
+        start, stop, statistic = _largest_statistic(total, *arguments)
+        log_p = np.minimum(log_ndtr(-statistic) + np.log(2.0 * count * places), 0.0)
+        if stop and (clearest is None or log_p.min() < clearest.log_p.min()):
+            clearest = _Split(start, stop, log_p)
+    return clearest
+
+
+@njit(cache=True)
+def _largest_statistic(
+    total: Array, square: Array, least_square: Array, cells_per_error: Array, shortest: int, switch: bool
+) -> tuple[int, int, Array]:
+    """Over stretches of at least `shortest` cells, the start, stop and statistics (f,) of the clearest; stop 0: none.
+
+    total (n + 1, f): cumulated features of the cells; square (f,): their summed squares; switch: only stretches that
+    reach an end of the walk, or only those that do not. A feature that changes too little to matter has statistic 0.
+    """
+    cells, features = len(total) - 1, total.shape[1]
+    best, best_start, best_stop = 0.0, 0, 0
+    here, chosen = np.zeros(features), np.zeros(features)
+    for start in range(cells):
+        for stop in range(start + shortest, cells + 1):
+            inside, outside = stop - start, cells - stop + start
+            if outside < shortest or (start == 0 or stop == cells) != switch:
+                continue
+            largest = 0.0
+            for f in range(features):
+                part = total[stop, f] - total[start, f]
+                inner, outer = part / inside, (total[cells, f] - part) / outside
+                within = (square[f] - inside * inner**2 - outside * outer**2) / cells
+                variance = max(within, least_square[f]) * cells_per_error[f] * (1.0 / inside + 1.0 / outside)
+                difference = abs(inner - outer)
+                here[f] = difference / np.sqrt(variance) if difference >= LEAST_CHANGE else 0.0
+                largest = max(largest, here[f])
+            if largest > best:
+                best, best_start, best_stop = largest, start, stop
+                chosen[:] = here
+    return best_start, best_stop, chosen

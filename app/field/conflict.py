@@ -61,38 +61,45 @@ def _layer(x_m: Array, y_m: Array, points: Sequence[Array], errors: Sequence[Arr
     merged = max(1, int(FINEST_M / step_m + 1e-9))
     first_m = np.array([x_m[0], y_m[0]]) + 0.5 * (merged - 1) * step_m
     shape = -(-len(y_m) // merged), -(-len(x_m) // merged)
-    seen, judged, square = (np.zeros(shape[0] * shape[1]) for _ in range(3))
+    seen, judged, square = np.zeros((3, *shape))
     for survey_points, error in zip(points, errors, strict=True):
         indices = np.rint((survey_points - first_m) / (merged * step_m)).astype(np.int64)
-        known = np.isfinite(error)
-        cells, _ = _spread(indices, np.ones(len(indices)), merged * step_m, shape)
-        seen[cells] += 1.0
-        cells, mean_square = _spread(indices[known], error[known], merged * step_m, shape)
-        judged[cells] += 1.0
-        square[cells] += mean_square
+        if len(indices):
+            box, near, known, mean_square = _spread(indices, error, merged * step_m, shape)
+            seen[box] += near
+            judged[box] += known
+            square[box] += np.where(known, mean_square, 0.0)
     conflict = np.sqrt(np.divide(square, judged, out=np.full_like(square, np.nan), where=judged >= 2.0))
     seen, conflict = (
-        each.reshape(shape).repeat(merged, axis=0).repeat(merged, axis=1)[: len(y_m), : len(x_m)]
-        for each in (seen, conflict)
+        each.repeat(merged, axis=0).repeat(merged, axis=1)[: len(y_m), : len(x_m)] for each in (seen, conflict)
     )
     return seen, conflict
 
 
-def _spread(indices: Indices, values: Array, step_m: float, shape: tuple[int, int]) -> tuple[Indices, Array]:
-    """Cells (flat) within REACH_M of a survey's observations, and the mean of `values` (n,) around each.
+def _spread(
+    indices: Indices, error: Array, step_m: float, shape: tuple[int, int]
+) -> tuple[tuple[slice, slice], NDArray[np.bool_], NDArray[np.bool_], Array]:
+    """A survey's part of the grid: where it is (rows, columns), the cells within REACH_M of its observations, those
+    within REACH_M of a judged one, and the mean squared error around each.
 
-    indices (n, 2): column and row of every observation. Observations in one cell are averaged first.
+    indices (n, 2): column and row of every observation; error (n,): NaN where not judged.
     """
-    if not len(indices):
-        return np.zeros(0, np.int64), np.zeros(0)
-    column, row = (indices - indices.min(axis=0)).T
-    _, first, place = np.unique(row * (column.max() + 1) + column, return_index=True, return_inverse=True)
-    mean = np.bincount(place, values) / np.bincount(place)
     reach = int(REACH_M / step_m + 1e-9)
     dx, dy = np.meshgrid(*[np.arange(-reach, reach + 1)] * 2)
     disc = np.hypot(dx, dy) * step_m <= REACH_M + 1e-9
-    column, row = (np.add.outer(indices[first, axis], d[disc]) for axis, d in enumerate((dx, dy)))
-    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-    weight = np.broadcast_to(mean[:, None], inside.shape)[inside]
-    cells, place = np.unique((row * shape[1] + column)[inside], return_inverse=True)
-    return cells, np.bincount(place, weight) / np.bincount(place)
+    low, high = indices.min(axis=0) - reach, indices.max(axis=0) + reach
+    wide, tall = (high - low + 1).tolist()
+    cell, place = np.unique((indices - low) @ [1, wide], return_inverse=True)
+    judged = np.isfinite(error)
+    known = np.bincount(place[judged], minlength=len(cell))
+    mean = np.bincount(place[judged], error[judged], len(cell)) / np.maximum(known, 1)
+    around = (cell[:, None] + (dy * wide + dx)[disc]).ravel()
+    near, weight, total = (
+        np.bincount(around, None if each is None else np.repeat(each, disc.sum()), tall * wide).reshape(tall, wide)
+        for each in (None, np.minimum(known, 1), mean)
+    )
+    (x0, y0), (x1, y1) = np.maximum(low, 0), np.minimum(high + 1, shape[::-1])
+    part = slice(y0 - low[1], y1 - low[1]), slice(x0 - low[0], x1 - low[0])
+    weight = weight[part]
+    box = slice(int(y0), int(y1)), slice(int(x0), int(x1))
+    return box, near[part] > 0, weight > 0, total[part] / np.maximum(weight, 1)

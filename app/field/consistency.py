@@ -10,8 +10,9 @@ The noise of a map is learned from all its surveys, so a bad one widens the sd i
 judged by sds brought down to what the errors of the other surveys show, where those are much smaller.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,16 +42,34 @@ def check_surveys(
     held_out: Mapping[str, HeldOut], names: tuple[str, ...], correlation_m: float
 ) -> dict[str, ConsistencyReport]:
     """The report of every survey, each judged by what the errors of the others show."""
-    absolute = {survey_id: np.abs(h.standardised) for survey_id, h in held_out.items()}
-    reports = {}
-    for survey_id, own in held_out.items():
-        others = [errors for other, errors in absolute.items() if other != survey_id and len(errors)]
-        scale = np.ones(len(names))
-        if others:
-            shown = GENEROSITY * ROBUST_SD * np.median(np.concatenate(others), axis=0)
-            scale = np.clip(shown, 1e-3, 1.0)
-        reports[survey_id] = check_consistency(replace(own, sd_uT=own.sd_uT * scale), names, correlation_m)
-    return reports
+    shown = _medians_of_others([np.abs(h.standardised) for h in held_out.values()])
+    scales = np.clip(GENEROSITY * ROBUST_SD * shown, 1e-3, 1.0)
+    return {
+        survey_id: check_consistency(replace(own, sd_uT=own.sd_uT * scale), names, correlation_m)
+        for (survey_id, own), scale in zip(held_out.items(), scales, strict=True)
+    }
+
+
+def _medians_of_others(values: Sequence[Array]) -> Array:
+    """(s, c) per survey, the median of all others' values (n, c) together; infinite where the others have none.
+
+    All values are sorted once: without those of a survey at sorted places r_0 < r_1 ..., the j-th lies at
+    j + (how many r_t - t are at most j).
+    """
+    pooled = np.concatenate(values)
+    order = np.argsort(pooled, axis=0)
+    place = np.empty_like(order)
+    np.put_along_axis(place, order, np.arange(len(pooled))[:, None], axis=0)
+    bounds = np.cumsum([0, *map(len, values)])
+    medians = np.full((len(values), pooled.shape[1]), np.inf)
+    for survey, (start, stop) in enumerate(pairwise(bounds.tolist())):
+        others = len(pooled) - (stop - start)
+        middle = np.array([(others - 1) // 2, others // 2])
+        for c in range(pooled.shape[1] if others else 0):
+            before = np.sort(place[start:stop, c]) - np.arange(stop - start)
+            at = middle + np.searchsorted(before, middle, side="right")
+            medians[survey, c] = np.mean(pooled[order[at, c], c])
+    return medians
 
 
 def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: float) -> ConsistencyReport:

@@ -175,7 +175,9 @@ def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Tab
     variance_uT2 = np.repeat(_means(place, np.square(held_out.sd_uT[judged])), len(OVERLAP), axis=0)
     corner = np.floor(walk.position_m[stretches, 1::-1] / STEP_M).astype(np.int64)
     cell = (corner[:, None] - OVERLAP).reshape(-1, 2)
-    block, place, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    low, wide = cell.min(axis=0), int(np.ptp(cell[:, 1])) + 1
+    key, place, count = np.unique((cell - low) @ [wide, 1], return_inverse=True, return_counts=True)
+    block = low + np.stack(np.divmod(key, wide), axis=1)
     heard = count >= FEWEST_STRETCHES
     if np.count_nonzero(heard) < FEWEST_BLOCKS:
         return None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.field.consistency import check_consistency
+from app.field.consistency import check_consistency, check_surveys
 from app.field.fit import fit_map
 from app.field.leave_one_out import HeldOut
 from app.field.spec import MapSpec
@@ -87,3 +87,20 @@ def test_the_p_value_accounts_for_correlation():
     correlated = check_consistency(held_out, ("norm",), 5.0).components[0].p_value
     assert independent < 1e-4
     assert correlated > 0.05
+
+
+@pytest.mark.parametrize("counts", [(30, 40, 51), (0, 30, 41), (25,)])
+def test_every_survey_is_judged_by_the_sds_the_others_show(counts):
+    rng = np.random.default_rng(0)
+    held_out = {
+        str(k): HeldOut(
+            0.1 * (k + 1) * rng.normal(size=(n, 2)), np.ones((n, 2)), np.ones(n, dtype=bool), np.arange(float(n))
+        )
+        for k, n in enumerate(counts)
+    }
+    reports = check_surveys(held_out, ("horizontal", "vertical"), 0.0)
+    for name, own in held_out.items():
+        others = [np.abs(h.error_uT) for other, h in held_out.items() if other != name and len(h.error_uT)]
+        shown = np.clip(1.5 * 1.4826 * np.median(np.concatenate(others), axis=0), 1e-3, 1.0) if others else np.ones(2)
+        if len(own.error_uT):
+            assert [c.mean_sd_ut for c in reports[name].components] == pytest.approx(shown)
