@@ -17,7 +17,7 @@ Percentiles = dict[str, float]  # "p5" to "p95"
 
 @dataclass(frozen=True, slots=True)
 class JudgedPoint:
-    """A measured cell, its gradient along the floor, and its expected error (None: no window that ends there is mapped)."""
+    """A measured cell, its gradient along the floor, its expected error (None: no window that ends there is mapped)."""
 
     position_m: tuple[float, float, float]
     gradient_uT_per_m: float
