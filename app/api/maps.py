@@ -131,8 +131,6 @@ def _find_map(session: Session, identity: Identity, map_id: str) -> Map:
 def _check_offered(body: NewMap) -> None:
     """Refuse what the contract names and this version does not have, one fault each."""
     faults = []
-    if body.engine == "compromise":
-        faults.append(Fault("/body/engine", "compromise is not offered yet; use hilbert, or exact for small maps"))
     if body.curl_free:
         faults.append(Fault("/body/curl_free", "curl-free maps are not offered yet; leave it false"))
     if body.heights_m is not None and len(body.heights_m) > 1:

@@ -6,10 +6,11 @@ place of a zero mean. Costs grow with the cube of the observations, so their num
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
 
@@ -22,7 +23,18 @@ from app.field.spec import BaseKernel, MapSpec, Progress
 from app.field.tile_fit import FitState
 from app.geometry import Array
 
-__all__ = ["MAX_OBSERVATIONS", "ExactProcess", "estimate_by_exact", "learn_exact"]
+__all__ = [
+    "MAX_OBSERVATIONS",
+    "Conditioned",
+    "ExactPosterior",
+    "ExactProcess",
+    "Observations",
+    "condition",
+    "estimate_by_exact",
+    "estimate_of",
+    "learn_components",
+    "learn_exact",
+]
 
 MAX_OBSERVATIONS = 2000
 CELLS_AT_ONCE = 2000
@@ -98,6 +110,36 @@ def learn_exact(kernel: BaseKernel, position_m: Array, deviation_uT: Array) -> E
     return ExactProcess(kernel, float(np.exp(log_length)), float(np.exp(log_signal / 2)), float(np.exp(log_noise / 2)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Positions (n, 3), features (n, c) about the ambient field (c,), and the index (n,) of the walk each is of."""
+
+    position_m: Array
+    deviation_uT: Array
+    walk: NDArray[np.int64]
+    ambient_uT: Array
+
+    @classmethod
+    def of(cls, walks: Sequence[Walk]) -> "Observations":
+        ambient_uT = ambient_field_uT(walks)
+        return cls(
+            np.concatenate([walk.position_m for walk in walks]),
+            np.concatenate([walk.field_uT for walk in walks]) - ambient_uT,
+            np.repeat(np.arange(len(walks)), [len(walk) for walk in walks]),
+            ambient_uT,
+        )
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+    def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Observations":
+        return Observations(self.position_m[chosen], self.deviation_uT[chosen], self.walk[chosen], self.ambient_uT)
+
+
+Conditioned = Callable[[Observations], list[ExactPosterior]]
+"""The map of some observations: one posterior per component."""
+
+
 def estimate_by_exact(
     walks: Sequence[Walk], spec: MapSpec, previous: FitState | None, progress: Progress
 ) -> FieldEstimate:
@@ -105,29 +147,59 @@ def estimate_by_exact(
 
     `previous` is not made use of. Raises InvalidInput above MAX_OBSERVATIONS, and for a sum of kernels.
     """
+    observations = Observations.of(walks)
+    if len(observations) > MAX_OBSERVATIONS:
+        raise InvalidInput(
+            f"the exact engine takes at most {MAX_OBSERVATIONS} observations and the surveys have {len(observations)}: "
+            "use engine compromise or hilbert"
+        )
+    processes = learn_components(spec, observations, progress)
+    return estimate_of(walks, spec, observations, processes, lambda some: condition(processes, some), progress)
+
+
+def learn_components(spec: MapSpec, observations: Observations, progress: Progress) -> list[ExactProcess]:
+    """The process of every component, each with hyper-parameters of its own: the first half of a fit.
+
+    Raises InvalidInput for a sum of kernels.
+    """
     kernel = base_kernel(spec.covariance)
     if is_sum(spec.covariance):
-        raise InvalidInput(f"the exact engine has one length for a kernel: ask for {kernel}, or use engine hilbert")
-    ambient_uT = ambient_field_uT(walks)
-    position_m = np.concatenate([walk.position_m for walk in walks])
-    deviation_uT = np.concatenate([walk.field_uT for walk in walks]) - ambient_uT
-    if len(position_m) > MAX_OBSERVATIONS:
         raise InvalidInput(
-            f"the exact engine takes at most {MAX_OBSERVATIONS} observations and the surveys have {len(position_m)}: "
-            "use engine hilbert"
+            f"the {spec.engine} engine has one length for a kernel: ask for {kernel}, or use engine hilbert"
         )
+    targets = observations.deviation_uT.T
     processes = []
-    for component, target in enumerate(deviation_uT.T):
-        progress(0.5 * component / len(ambient_uT), f"learning component {component + 1} of {len(ambient_uT)}")
-        processes.append(learn_exact(kernel, position_m, target))
+    for component, target in enumerate(targets):
+        progress(0.5 * component / len(targets), f"learning component {component + 1} of {len(targets)}")
+        processes.append(learn_exact(kernel, observations.position_m, target))
+    return processes
+
+
+def condition(processes: Sequence[ExactProcess], observations: Observations) -> list[ExactPosterior]:
+    """The posterior of every component."""
+    targets = observations.deviation_uT.T
+    return [p.condition(observations.position_m, target) for p, target in zip(processes, targets, strict=True)]
+
+
+def estimate_of(
+    walks: Sequence[Walk],
+    spec: MapSpec,
+    observations: Observations,
+    processes: Sequence[ExactProcess],
+    conditioned: Conditioned,
+    progress: Progress,
+) -> FieldEstimate:
+    """The field on the cells; every walk predicted by an honest refit without it, at the same hyper-parameters."""
     longest_m = max(p.length_m for p in processes)
     frame = GridFrame.around(walks, spec.resolution_m, longest_m, layer_heights_m(walks, spec))
-    posteriors = [p.condition(position_m, y) for p, y in zip(processes, deviation_uT.T, strict=True)]
-    mean_uT, variance_ratio, gradient = _on_cells(posteriors, frame, progress)
-    held_out = {walk.survey_id: _predict_left_out(walk, walks, processes, ambient_uT) for walk in walks}
+    mean_uT, variance_ratio, gradient = _on_cells(conditioned(observations), frame, progress)
+    held_out = {}
+    for index, walk in enumerate(walks):
+        progress(0.9 + 0.1 * index / len(walks), f"leaving out survey {index + 1} of {len(walks)}")
+        held_out[walk.survey_id] = _predict(conditioned, observations[observations.walk != index], walk)
     return FieldEstimate(
         frame=frame,
-        ambient_uT=ambient_uT,
+        ambient_uT=observations.ambient_uT,
         mean_uT=mean_uT,
         variance_ratio=variance_ratio,
         gradient_uT_per_m=gradient,
@@ -136,7 +208,7 @@ def estimate_by_exact(
         held_out_mean_uT={name: mean for name, (mean, _) in held_out.items()},
         held_out_variance_ratio={name: variance for name, (_, variance) in held_out.items()},
         hyperparameters={
-            "kernel": kernel,
+            "kernel": processes[0].kernel,
             "length_m": [p.length_m for p in processes],
             "signal_sd_ut": [p.signal_sd_uT for p in processes],
             "white_noise_sd_ut": [p.noise_sd_uT for p in processes],
@@ -160,19 +232,11 @@ def _on_cells(posteriors: Sequence[ExactPosterior], frame: GridFrame, progress: 
     return mean.reshape(cells), variance.reshape(cells), gradient.reshape(3, *cells)
 
 
-def _predict_left_out(
-    left_out: Walk, walks: Sequence[Walk], processes: Sequence[ExactProcess], ambient_uT: Array
-) -> tuple[Array, Array]:
-    """Mean and variance ratio (n, c) of a walk's observations from a refit without it."""
-    others = [walk for walk in walks if walk is not left_out]
-    if not others:
-        return np.zeros(left_out.field_uT.shape), np.ones(left_out.field_uT.shape)
-    position_m = np.concatenate([walk.position_m for walk in others])
-    deviation_uT = np.concatenate([walk.field_uT for walk in others]) - ambient_uT
-    predictions = [
-        process.condition(position_m, target).at(left_out.position_m)
-        for process, target in zip(processes, deviation_uT.T, strict=True)
-    ]
+def _predict(conditioned: Conditioned, others: Observations, walk: Walk) -> tuple[Array, Array]:
+    """Mean and variance ratio (n, c) of a walk's observations from the others'; the prior's where there are none."""
+    if not len(others):
+        return np.zeros(walk.field_uT.shape), np.ones(walk.field_uT.shape)
+    predictions = [component.at(walk.position_m) for component in conditioned(others)]
     mean, variance = (np.stack(columns, axis=1) for columns in zip(*predictions, strict=True))
     return mean, variance
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from app.errors import InvalidInput
+from app.field.compromise_engine import estimate_by_compromise
 from app.field.conflict import quality_layers
 from app.field.consistency import check_surveys
 from app.field.drift import out_of_date_regions
@@ -25,7 +26,11 @@ from app.geometry import Array
 __all__ = ["fit_map"]
 
 _Estimator = Callable[[Sequence[Walk], MapSpec, FitState | None, Progress], FieldEstimate]
-_ENGINES: dict[Engine, _Estimator] = {"hilbert": estimate_by_hilbert, "exact": estimate_by_exact}
+_ENGINES: dict[Engine, _Estimator] = {
+    "hilbert": estimate_by_hilbert,
+    "exact": estimate_by_exact,
+    "compromise": estimate_by_compromise,
+}
 
 
 def _silent(fraction: float, message: str) -> None:

@@ -32,7 +32,7 @@ __all__ = [
     "SegmentConsistency",
 ]
 
-Engine = Literal["hilbert", "exact"]
+Engine = Literal["hilbert", "exact", "compromise"]
 BaseKernel = Literal["squared_exponential", "matern32", "matern52"]
 Kernel = Literal[
     "squared_exponential",

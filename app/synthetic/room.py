@@ -17,6 +17,7 @@ __all__ = [
     "EPSILON_SCAN_M",
     "GAMMA_SCAN_M",
     "LOWER_FOUR_M",
+    "TAKE_OFF_M",
     "TRAINING_BOX_M",
     "UPPER_FOUR_M",
     "UTILIZATION_BOX_M",
@@ -35,6 +36,8 @@ UPPER_FOUR_M = (1.5, 1.75, 2.0, 2.25)
 GAMMA_SCAN_M = (0.5, 1.375, 2.25)
 EPSILON_SCAN_M = (0.75, 1.5, 2.0)
 """The altitudes of the flights (Kuevor, L727, L1639)."""
+TAKE_OFF_M = np.array([[0.0, 0.0, height] for height in np.linspace(0.0, 0.5, 8)[:-1]])
+"""(7, 3) nodes of a compromise map below the box, where drones take off (Kuevor, L762)."""
 
 STEEPEST_UT_PER_M = 20.0
 _EARTH_UT = np.array([2.0, -18.0, -50.0])

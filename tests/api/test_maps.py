@@ -248,7 +248,19 @@ def test_an_older_build_never_replaces_a_newer_one(
     assert results[0]["grid_sha256"] == results[1]["grid_sha256"], "the same surveys give the same map"
 
 
-@pytest.mark.parametrize("body", [{"engine": "compromise"}, {"curl_free": True}, {"heights_m": [1.0, 2.0]}])
+def test_a_compromise_map_on_request_says_how_near_it_is(service: Any, mapped_floor: str) -> None:
+    body = {"engine": "compromise", "components": "norm", "activate": False, "resolution_m": 0.5}
+    asked = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body)
+    assert asked.status_code == 202, asked.text
+    service.run_jobs()
+    made = service.http.get(f"/v1/maps/{asked.json()['map']['id']}").json()
+    assert (made["status"], made["engine"]) == ("ready", "compromise")
+    assert made["hyperparameters"]["nodes"] > 8
+    assert made["hyperparameters"]["rmse_against_intermediate_ut"][0] < 0.1
+    assert made["score"]["rmse_ut"][0] < 5.0
+
+
+@pytest.mark.parametrize("body", [{"curl_free": True}, {"heights_m": [1.0, 2.0]}])
 def test_what_is_not_offered_yet_says_so(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
     answer = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body)
     assert answer.status_code == 422
