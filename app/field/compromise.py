@@ -62,7 +62,7 @@ def compromise(intermediate: ExactPosterior, node_m: Array, with_covariance: boo
     `k K11^-1 M` and variance `k(0) - k K11^-1 (K11 - C) K11^-1 k` for predictions M of posterior covariance C.
     """
     if not with_covariance:
-        return intermediate.process.condition(node_m, intermediate.mean_at(node_m))
+        return _as_observations(intermediate, node_m)
     told = interpolate(intermediate, node_m)
     between = _prior_uT2(told.process, intermediate.position_m, node_m)
     seen = solve_triangular(intermediate.factor, between, lower=True, check_finite=False)
@@ -118,13 +118,19 @@ def study_density(
 
     grids: spacing and nodes (n1, 3); validation: positions (n, 3) and field about the ambient (n, c) of each log.
     """
+    told = interpolate if with_covariance else _as_observations
     rows = []
     for spacing_m, node_m in grids:
-        maps = [compromise(component, node_m, with_covariance) for component in intermediate]
+        maps = [told(component, node_m) for component in intermediate]
         errors_uT = [np.stack([m.mean_at(p) for m in maps], axis=1) - field_uT for p, field_uT in validation]
         rmse = tuple(float(np.sqrt(np.mean(np.sum(np.square(error), axis=1)))) for error in errors_uT)
         rows.append(Density(spacing_m, len(node_m), rmse))
     return rows
+
+
+def _as_observations(intermediate: ExactPosterior, node_m: Array) -> ExactPosterior:
+    """The seed's: predictions taken for observations as noisy as measurements."""
+    return intermediate.process.condition(node_m, intermediate.mean_at(node_m))
 
 
 def _crossings(axes: Sequence[Array]) -> Array:
