@@ -34,6 +34,10 @@ class BlobStore(Protocol):
         """Whether the store has a blob of this hash (its content is checked by `get`)."""
         ...
 
+    def discard(self, sha256: str) -> None:
+        """Forget a blob that nothing refers to any more; none there is as good."""
+        ...
+
 
 class FolderBlobStore:
     """Blobs in a local folder, fanned out over two levels: `ab/cd/abcd...`."""
@@ -70,6 +74,10 @@ class FolderBlobStore:
     def exists(self, sha256: str) -> bool:
         _check_name(sha256)
         return self._path(sha256).is_file()
+
+    def discard(self, sha256: str) -> None:
+        _check_name(sha256)
+        self._path(sha256).unlink(missing_ok=True)
 
     def _path(self, sha256: str) -> Path:
         return self._folder / sha256[:2] / sha256[2:4] / sha256

@@ -50,6 +50,14 @@ class BlobStoreContract(ABC):
         sha256 = self.open(tmp_path).put(b"magnetite")
         assert self.open(tmp_path).get(sha256) == b"magnetite"
 
+    def test_a_discarded_blob_is_gone_and_can_be_put_again(self, tmp_path: Path) -> None:
+        store = self.open(tmp_path)
+        sha256 = store.put(b"magnetite")
+        store.discard(sha256)
+        store.discard(sha256)
+        assert not store.exists(sha256)
+        assert store.get(store.put(b"magnetite")) == b"magnetite"
+
     def test_an_absent_blob_is_not_found(self, tmp_path: Path) -> None:
         store = self.open(tmp_path)
         assert not store.exists(ABSENT)

@@ -17,9 +17,8 @@ from sqlalchemy import select
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.db.tables import Job
+from app.db.tables import BUILD, REBUILD, Job
 from app.errors import IsodynError, JobCancelled, NotFound
-from app.jobs.engine import BUILD, REBUILD
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, claim_generation, lock_floor
 from workers.builder import Builder, Plan, Result

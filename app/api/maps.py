@@ -2,6 +2,7 @@
 
 from datetime import datetime
 from hashlib import sha256 as sha256_of
+from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,7 +25,9 @@ from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Floor, Map, Survey
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
 from app.field.grid import FieldGrid
+from app.field.kernels import base_kernel, is_sum
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
+from app.field.spec import Kernel, Noise
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
@@ -42,8 +45,16 @@ class NewMap(RequestModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert"}]})
     engine: Literal["hilbert", "exact", "compromise"] = "hilbert"
     components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
-    kernel: Literal["squared_exponential", "matern32", "matern52"] | None = None
-    curl_free: Annotated[bool, Field(description="true is not offered yet: components are independent")] = False
+    kernel: Annotated[
+        Kernel | None, Field(description="one, or a sum of two lengths; default matern32, for curl-free maps matern52")
+    ] = None
+    curl_free: Annotated[
+        bool, Field(description="the field as the gradient of a potential: vector maps, engine hilbert")
+    ] = False
+    noise: Annotated[
+        Noise, Field(description="walk: errors along a walk may be correlated, as far as the data say so; white: never")
+    ] = "walk"
+    robust: Annotated[bool, Field(description="heavy-tailed errors: stray readings count less")] = False
     resolution_m: Annotated[Finite, Field(ge=0.05, le=5.0)] = 0.25
     heights_m: Annotated[
         list[Metres], Field(min_length=1, max_length=100, description="one height; default: the samples' median")
@@ -128,13 +139,17 @@ def _find_map(session: Session, identity: Identity, map_id: str) -> Map:
     return row
 
 
-def _check_offered(body: NewMap) -> None:
-    """Refuse what the contract names and this version does not have, one fault each."""
+def _check_together(body: NewMap) -> None:
+    """Refuse what does not go together, one fault each."""
     faults = []
-    if body.curl_free:
-        faults.append(Fault("/body/curl_free", "curl-free maps are not offered yet; leave it false"))
-    if body.heights_m is not None and len(body.heights_m) > 1:
-        faults.append(Fault("/body/heights_m", "maps of several heights are not offered yet; name one"))
+    if body.curl_free and (body.engine != "hilbert" or body.components not in (None, "vector")):
+        faults.append(Fault("/body/curl_free", "needs engine hilbert and components vector"))
+    if body.robust and body.engine != "hilbert":
+        faults.append(Fault("/body/robust", "needs engine hilbert"))
+    if body.kernel is not None and is_sum(body.kernel) and body.engine != "hilbert":
+        faults.append(Fault("/body/kernel", f"a sum needs engine hilbert; ask for {base_kernel(body.kernel)}"))
+    if body.heights_m is not None and any(b - a < 0.01 for a, b in pairwise(body.heights_m)):
+        faults.append(Fault("/body/heights_m", "heights must rise, by a centimetre at least"))
     if faults:
         raise InvalidInput(faults[0].reason, *faults)
 
@@ -153,6 +168,8 @@ def _check_surveys(session: Session, floor_id: str, body: NewMap) -> list[str]:
     frames: set[SampleFrame] = {row.frame for row in rows}
     best = richest_components(frames)
     order = list(COMPONENT_NAMES)
+    if body.curl_free and best != "vector":
+        raise IncompatibleFrames(f"surveys in the {' and '.join(sorted(frames))} frame give no vector: no curl either")
     if body.components is not None and order.index(body.components) < order.index(best):
         raise IncompatibleFrames(
             f"surveys in the {' and '.join(sorted(frames))} frame cannot all give a {body.components} map; "
@@ -167,7 +184,7 @@ def create_map(
 ) -> Response:
     """A floor with `auto_build` builds by itself after each change; this builds with parameters of your own."""
 
-    _check_offered(body)
+    _check_together(body)
 
     def create(session: Session) -> tuple[int, BaseModel]:
         floor = find_floor(session, identity, floor_id)
@@ -176,7 +193,7 @@ def create_map(
             floor_id=floor.id,
             status="accepted",
             activate=body.activate,
-            spec=body.model_dump(exclude={"survey_ids", "activate", "curl_free"}, exclude_none=True),
+            spec=body.model_dump(exclude={"survey_ids", "activate"}, exclude_none=True),
             survey_ids=_check_surveys(session, floor.id, body),
         )
         session.add(row)

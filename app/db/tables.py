@@ -13,6 +13,7 @@ from sqlalchemy.types import TypeDecorator
 from uuid6 import uuid7
 
 __all__ = [
+    "BUILD",
     "Base",
     "Building",
     "Floor",
@@ -21,10 +22,14 @@ __all__ = [
     "Key",
     "Map",
     "Organisation",
+    "REBUILD",
     "Survey",
     "Worker",
     "new_id",
 ]
+
+BUILD, REBUILD = "build", "rebuild"
+"""Kinds of jobs: a map that somebody asked for, and a floor's next one after its surveys changed."""
 
 
 def new_id() -> str:

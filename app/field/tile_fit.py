@@ -87,7 +87,13 @@ def fit_tile(
         for survey_id, inside in tiled.answered(tile).items():
             others = total - evidence[survey_id]
             held_out[survey_id] = HeldOutPart(*predict(basis, others, hyper, tiled.points_m[inside]))
-    return TileFit(tuple(evidence), fitted.patch(x_m, y_m, heights_m), held_out, borders)
+    return TileFit(tuple(evidence), _rounded(fitted.patch(x_m, y_m, heights_m)), held_out, borders)
+
+
+def _rounded(patch: Patch) -> Patch:
+    """To single precision, in which a fit is kept: one that was kept and one that was not must not differ."""
+    mean, gradient, variance = (values.astype(np.float32).astype(np.float64) for values in patch[:3])
+    return Patch(mean, gradient, variance, patch.potential_uT_m)
 
 
 def _evidence(

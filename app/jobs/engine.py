@@ -11,13 +11,11 @@ from sqlalchemy.engine import URL
 
 from app.db.engine import teach_old_sqlite
 
-__all__ = ["APPLICATION", "APPLICATION_VERSION", "BUILD", "QUEUE", "REBUILD", "engine_configuration", "open_client"]
+__all__ = ["APPLICATION", "APPLICATION_VERSION", "QUEUE", "engine_configuration", "open_client"]
 
 APPLICATION = "isodyn"
 APPLICATION_VERSION = "jobs-1"
 QUEUE = "floors"
-REBUILD = "rebuild"
-BUILD = "build"
 
 logging.getLogger("dbos").setLevel(logging.WARNING)
 

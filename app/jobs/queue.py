@@ -10,9 +10,9 @@ from dbos import EnqueueOptions
 from sqlalchemy import Engine, select, update
 from sqlalchemy.orm import Session
 
-from app.db.tables import Floor, Job, Map
+from app.db.tables import BUILD, REBUILD, Floor, Job, Map
 from app.errors import NotFound
-from app.jobs.engine import APPLICATION_VERSION, BUILD, QUEUE, REBUILD, open_client
+from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 
 __all__ = ["FINAL_STATES", "JobQueue", "claim_generation", "lock_floor"]
 

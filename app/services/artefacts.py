@@ -28,7 +28,7 @@ __all__ = [
 
 def grid_to_bytes(grid: FieldGrid) -> bytes:
     """A grid as one immutable blob."""
-    return _save(
+    return pack(
         {"kind": "grid", "components": grid.components, "resolution_m": grid.resolution_m,
          "origin_m": list(grid.origin_m), "error_correlation_m": grid.error_correlation_m},
         {"heights_m": grid.heights_m, "mean_uT": grid.mean_uT, "sd_uT": grid.sd_uT,
@@ -39,7 +39,7 @@ def grid_to_bytes(grid: FieldGrid) -> bytes:
 
 def grid_from_bytes(data: bytes) -> FieldGrid:
     """The grid in a blob. Raises CorruptArtefact."""
-    header, arrays = _load(data, "grid")
+    header, arrays = unpack(data, "grid")
     return FieldGrid(
         components=header["components"],
         origin_m=(header["origin_m"][0], header["origin_m"][1]),
@@ -51,12 +51,12 @@ def grid_from_bytes(data: bytes) -> FieldGrid:
 
 def layers_to_bytes(layers: Mapping[str, NDArray[Any]]) -> bytes:
     """Further layers of a grid, (nz, ny, nx) each, as one immutable blob in single precision."""
-    return _save({"kind": "layers"}, {name: np.asarray(layer, np.float32) for name, layer in layers.items()})
+    return pack({"kind": "layers"}, {name: np.asarray(layer, np.float32) for name, layer in layers.items()})
 
 
 def layers_from_bytes(data: bytes) -> dict[str, NDArray[np.float32]]:
     """The layers in a blob, by name. Raises CorruptArtefact."""
-    _, arrays = _load(data, "layers")
+    _, arrays = unpack(data, "layers")
     return dict(sorted(arrays.items()))
 
 
@@ -65,22 +65,24 @@ def samples_to_bytes(samples: Samples) -> bytes:
     arrays = {"t_s": samples.t_s, "p_building_m": samples.p_building_m, "B_uT": samples.B_uT}
     if samples.q_body_to_building is not None:
         arrays["q_body_to_building"] = samples.q_body_to_building
-    return _save({"kind": "samples", "frame": samples.frame, "session": samples.session}, arrays)
+    return pack({"kind": "samples", "frame": samples.frame, "session": samples.session}, arrays)
 
 
 def samples_from_bytes(data: bytes) -> Samples:
     """The samples in a blob. Raises CorruptArtefact."""
-    header, arrays = _load(data, "samples")
+    header, arrays = unpack(data, "samples")
     return Samples(frame=header["frame"], session=header["session"], **arrays)
 
 
-def _save(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def pack(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Arrays by name under a JSON header, whose `kind` says what they are."""
     # One metadata entry, because the order of several is not fixed and the bytes must be.
     metadata = {"isodyn": json.dumps({"version": 1, **header}, sort_keys=True)}
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
 
 
-def _load(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header and arrays of a blob. Raises CorruptArtefact when they are not of this kind."""
     try:
         length = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["isodyn"])

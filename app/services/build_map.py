@@ -15,12 +15,14 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from app.blobs import BlobStore
-from app.db.tables import Floor, Job, Map, Survey
-from app.errors import InvalidInput, NotFound
+from app.db.tables import REBUILD, Floor, Job, Map, Survey
+from app.errors import CorruptArtefact, InvalidInput, NotFound
 from app.field.fit import fit_map
 from app.field.samples import SampleFrame, richest_components
 from app.field.spec import FittedMap, MapSpec
+from app.field.tile_fit import FitState
 from app.services.artefacts import grid_to_bytes, layers_to_bytes, samples_from_bytes
+from app.services.fit_state import state_from_bytes, state_to_bytes
 
 __all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "publish_build"]
 
@@ -59,7 +61,28 @@ def claim_build(session: Session, job_id: str) -> Plan:
         "sequence": map_row.sequence,
         "spec": map_row.spec,
         "surveys": sorted([row.id, row.samples_sha256, row.frame] for row in surveys),
+        **_earlier_states(session, job, map_row),
     }
+
+
+def _earlier_states(session: Session, job: Job, map_row: Map) -> Plan:
+    """`previous`: the newest map of the floor with these parameters, if its fit can be continued; a build that was
+
+    asked for learns anew. `stale_states`: what earlier builds left and nobody will continue; their maps forget them.
+    """
+    kept = session.scalars(
+        select(Map)
+        .where(Map.floor_id == job.floor_id, Map.state_sha256.is_not(None), Map.id != map_row.id)
+        .order_by(Map.sequence.desc())
+    ).all()
+    stale = [earlier.state_sha256 for earlier in kept[1:]]
+    for earlier in kept[1:]:
+        earlier.state_sha256 = None
+    newest = kept[0] if kept else None
+    if newest is None or job.kind != REBUILD or newest.spec != map_row.spec:
+        return {"previous": None, "stale_states": stale}
+    previous = {"state_sha256": newest.state_sha256, "components": newest.components, "survey_ids": newest.survey_ids}
+    return {"previous": previous, "stale_states": [sha256 for sha256 in stale if sha256 != newest.state_sha256]}
 
 
 def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
@@ -77,17 +100,52 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
     parameters.setdefault("components", richest_components({frame for _, _, frame in surveys}))
     if parameters.get("heights_m"):
         parameters["heights_m"] = tuple(parameters["heights_m"])
-    fitted = fit_map(walks, MapSpec(**parameters), lambda f, message: progress(0.02 + 0.93 * f, message))
+    previous = _previous_state(plan, parameters["components"], blobs)
+    fitted = fit_map(
+        walks, MapSpec(**parameters), lambda f, message: progress(0.02 + 0.93 * f, message), previous=previous
+    )
     progress(0.96, "storing the grid")
+    for sha256 in plan.get("stale_states", []):
+        blobs.discard(sha256)
+    state = state_to_bytes(fitted.state) if fitted.state else None
+    changes = _changes(plan, fitted, previous)
     return {
+        "state_sha256": blobs.put(state) if state else None,
+        "changes": changes,
         "grid_sha256": blobs.put(grid_to_bytes(fitted.grid)),
         "layers_sha256": blobs.put(layers_to_bytes(fitted.layers)) if fitted.layers else None,
-        "quality_sha256": blobs.put(_quality_bytes(fitted)),
+        "quality_sha256": blobs.put(_quality_bytes(fitted, changes)),
         "components": fitted.grid.components,
         "bounds_m": list(fitted.grid.bounds_m),
         "hyperparameters": fitted.hyperparameters,
         "score": asdict(fitted.score) if fitted.score else None,
         "score_reason": fitted.score_reason,
+    }
+
+
+def _previous_state(plan: Plan, components: str, blobs: BlobStore) -> FitState | None:
+    """The fit to continue, if there is one that can be read."""
+    previous = plan.get("previous")
+    if not previous or previous["components"] != components:
+        return None
+    try:
+        return state_from_bytes(blobs.get(previous["state_sha256"]))
+    except (NotFound, CorruptArtefact):
+        return None
+
+
+def _changes(plan: Plan, fitted: FittedMap, previous: FitState | None) -> Result:
+    """What this build did beside the map before it."""
+    now = {survey_id for survey_id, _, _ in plan["surveys"]}
+    continued = previous is not None and fitted.state is not None and fitted.state.learned is previous.learned
+    before = set(plan["previous"]["survey_ids"]) if continued else set()
+    tiles = len(fitted.state.tiles) if fitted.state else 0
+    return {
+        "hyperparameters": "kept" if continued else "learned",
+        "surveys_added": sorted(now - before),
+        "surveys_removed": sorted(before - now),
+        "tiles_fitted": fitted.tiles_refitted if fitted.state else None,
+        "tiles": tiles or None,
     }
 
 
@@ -107,7 +165,9 @@ def publish_build(session: Session, job_id: str, plan: Plan, result: Result) -> 
     overtaken = "; a newer map, or one chosen by hand, stays active" if map_row.activate else ""
     _end(job, "successful", "the map is ready" + (" and active" if activated else overtaken))
     job.progress = 100
-    job.result = {"map_id": map_row.id, "sha256": map_row.grid_sha256, "activated": activated}
+    job.result = {
+        "map_id": map_row.id, "sha256": map_row.grid_sha256, "activated": activated, "changes": result.get("changes"),
+    }  # fmt: skip
 
 
 def fail_build(session: Session, job_id: str, message: str) -> None:
@@ -154,7 +214,7 @@ def _wanted_surveys(session: Session, floor_id: str, map_row: Map) -> list[str]:
     return list(session.scalars(wanted))
 
 
-def _quality_bytes(fitted: FittedMap) -> bytes:
+def _quality_bytes(fitted: FittedMap, changes: Result) -> bytes:
     quality: Mapping[str, Any] = {
         "score": asdict(fitted.score) if fitted.score else None,
         "score_reason": fitted.score_reason,
@@ -163,6 +223,7 @@ def _quality_bytes(fitted: FittedMap) -> bytes:
         "noise_sd_ut": [float(sd) for sd in fitted.grid.noise_sd_uT],
         "error_correlation_m": fitted.grid.error_correlation_m,
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
+        "changes": changes,
         "out_of_date": [asdict(region) for region in fitted.out_of_date],
     }
     return json.dumps(quality, sort_keys=True, allow_nan=False).encode()

@@ -3,15 +3,13 @@
 import io
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import netcdf_file
 
-from app.db.tables import Floor, Map
-from app.field.fit import fit_map
+from app.db.tables import Map
 from app.services.artefacts import layers_from_bytes, layers_to_bytes
 
 
@@ -148,24 +146,13 @@ def test_a_layer_of_the_fit_is_shown_and_has_its_own_tag(service: Any, layered_m
     assert etags[0] != etags[1]
 
 
-def test_what_a_fit_leaves_beside_its_grid_is_kept(
-    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fit_with_layers(*arguments: Any) -> Any:
-        fitted = fit_map(*arguments)
-        return replace(fitted, layers={"conflict": np.full(fitted.grid.measured.shape, 1.5)})
-
-    monkeypatch.setattr("app.services.build_map.fit_map", fit_with_layers)
-    floor = new_floor()
-    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
-    service.run_jobs()
+def test_what_a_fit_leaves_beside_its_grid_is_kept(service: Any, active_map: str) -> None:
     with service.context.transaction() as session:
-        row = session.get_one(Map, session.get_one(Floor, floor).active_map_id)
-        sha256, map_id = row.layers_sha256, row.id
+        sha256 = session.get_one(Map, active_map).layers_sha256
     layers = layers_from_bytes(service.context.blobs.get(sha256))
-    assert list(layers) == ["conflict"]
-    assert (layers["conflict"] == 1.5).all()
-    assert service.http.get(f"/v1/maps/{map_id}/heatmap.png", params={"layer": "conflict"}).status_code == 200
+    assert {"coverage", "conflict"} <= set(layers)
+    assert layers["coverage"].max() == 3.0, "three surveys cross the floor"
+    assert service.http.get(f"/v1/maps/{active_map}/heatmap.png", params={"layer": "conflict"}).status_code == 200
 
 
 def test_the_static_view_is_one_self_contained_page(service: Any, active_map: str) -> None:
@@ -260,12 +247,72 @@ def test_a_compromise_map_on_request_says_how_near_it_is(service: Any, mapped_fl
     assert made["score"]["rmse_ut"][0] < 5.0
 
 
-@pytest.mark.parametrize("body", [{"curl_free": True}, {"heights_m": [1.0, 2.0]}])
-def test_what_is_not_offered_yet_says_so(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"curl_free": True, "engine": "exact"},
+        {"curl_free": True, "components": "norm"},
+        {"heights_m": [2.0, 1.0]},
+        {"kernel": "matern32+matern32", "engine": "exact"},
+        {"robust": True, "engine": "exact"},
+    ],
+)
+def test_parameters_that_do_not_go_together_are_refused(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
     answer = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body)
     assert answer.status_code == 422
-    assert "not offered yet" in answer.json()["detail"]
     assert answer.json()["errors"][0]["location"] == f"/body/{next(iter(body))}"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"curl_free": True, "heights_m": [0.9, 1.5], "noise": "white"},
+        {"kernel": "matern32+matern32", "robust": True},
+    ],
+)
+def test_every_kind_of_map_can_be_built_and_asked(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body | {"resolution_m": 0.5, "activate": False})
+    assert answer.status_code == 202, answer.text
+    service.run_jobs()
+    map_id = answer.json()["map"]["id"]
+    shown = service.http.get(f"/v1/maps/{map_id}").json()
+    assert shown["status"] == "ready"
+    heights = body.get("heights_m")
+    bounds = shown["bounds_m"]
+    centre = [(bounds[0] + bounds[3]) / 2, (bounds[1] + bounds[4]) / 2, 1.2]
+    field = service.http.post(f"/v1/maps/{map_id}/field", json={"points_m": [centre], "gradient": True}).json()
+    assert field["measured"] == [True]
+    slopes = field["gradient_ut_per_m"][0]
+    assert (slopes[0][2] is None) == (heights is None)
+    if heights:
+        assert [bounds[2], bounds[5]] == heights
+        assert slopes[0][1] == pytest.approx(slopes[1][0], abs=1e-6)
+        assert slopes[0][2] == pytest.approx(slopes[2][0], abs=1e-6)
+
+
+def test_a_rebuild_continues_the_last_fit_and_says_what_changed(service: Any, new_floor: Any, walk_csv: Any) -> None:
+    floor = new_floor()
+    for seed in (1, 2, 3):
+        survey = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(seed, offset_m=0.2 * seed)).json()
+    last = survey["survey"]["id"]
+
+    def rebuilt() -> dict[str, Any]:
+        service.run_jobs()
+        active = service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
+        shown = service.http.get(f"/v1/maps/{active}").json()
+        return shown | {"changes": service.http.get(f"/v1/maps/{active}/quality").json()["changes"]}
+
+    first = rebuilt()
+    blobs = service.blob_count()
+    assert service.http.patch(f"/v1/surveys/{last}", json={"included": False}).status_code == 200
+    without = rebuilt()
+    assert service.http.patch(f"/v1/surveys/{last}", json={"included": True}).status_code == 200
+    again = rebuilt()
+    assert first["changes"]["hyperparameters"] == "learned"
+    assert without["changes"]["hyperparameters"] == again["changes"]["hyperparameters"] == "kept"
+    assert without["changes"]["surveys_removed"] == again["changes"]["surveys_added"] == [last]
+    assert without["sha256"] != first["sha256"] == again["sha256"]
+    assert service.blob_count() == blobs + 5, "two grids, layers, three reports, and of the states of fits the last two"
 
 
 def test_pointers_have_etags_that_follow_their_state(service: Any, mapped_floor: str, active_map: str) -> None:
