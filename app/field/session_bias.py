@@ -27,7 +27,7 @@ from app.geometry import Array, rotate_by_quaternion
 
 __all__ = [
     "SessionBias", "SessionCalibration", "calibrate_sessions", "estimate_session_biases", "offset_variance_uT2",
-    "remove_session_biases",
+    "remove_session_biases", "unmet_session",
 ]  # fmt: skip
 
 STRETCH_M = 0.6
@@ -39,6 +39,8 @@ RETURN_M = 10.0
 MEETING_SD_UT = 8.0
 PRIOR_SCALE_UT, PRIOR_VERTICAL_SCALE_UT, PRIOR_FREEDOM = 3.0, 1.5, 3.0
 """Across and along a session's mean vertical; these and the meetings' sd by walks left out, whole, in a mall."""
+WIDEST = (PRIOR_FREEDOM - 2.0) / PRIOR_FREEDOM
+"""Precision of a Student distribution over that of its scale."""
 _ITERATIONS = 20
 
 
@@ -107,6 +109,13 @@ def calibrate_sessions(walks: Mapping[str, Samples], components: Components) -> 
     return SessionCalibration(cleaned, left, biases)
 
 
+def unmet_session(samples: Samples) -> SessionBias:
+    """What is expected of the offset of a session that no other walk shares: none, with the prior's covariance."""
+    assert samples.q_body_to_building is not None
+    up = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()[:, 2].mean(axis=0)
+    return SessionBias(np.zeros(3), np.linalg.inv(WIDEST * _prior_precision(up)))
+
+
 def offset_variance_uT2(samples: Samples, bias: SessionBias, components: Components) -> Array:
     """(n, c) variance that what is unknown of the offset puts into every sample's features, to first order."""
     assert samples.q_body_to_building is not None
@@ -134,7 +143,11 @@ def estimate_session_biases(walks: Mapping[str, Samples]) -> dict[str, SessionBi
         return {}
     stretches = _stretches(known, sessions)
     design, difference_uT = _meetings(stretches, len(sessions))
-    bias_uT, covariance = _solve(design, difference_uT, _prior_precisions(stretches, len(sessions)))
+    bias_uT, covariance = _solve(
+        design,
+        difference_uT,
+        [_prior_precision(stretches.rotation[stretches.session == k, 2].mean(axis=0)) for k in range(len(sessions))],
+    )
     parts = [slice(3 * number, 3 * number + 3) for number in range(len(sessions))]
     return {name: SessionBias(bias_uT[p], covariance[p, p]) for name, p in zip(sessions, parts, strict=True)}
 
@@ -193,14 +206,10 @@ def _meetings(s: _Stretches, sessions: int) -> tuple[Array, Array]:
     return design.transpose(0, 2, 1, 3).reshape(m, 3, 3 * sessions), difference_uT
 
 
-def _prior_precisions(s: _Stretches, sessions: int) -> list[Array]:
-    """Per session the (3, 3) precision of a Gaussian prior: tighter along its mean vertical than across."""
-    precisions = []
-    for session in range(sessions):
-        up = s.rotation[s.session == session, 2].mean(axis=0)
-        along = np.outer(up, up) / (up @ up)
-        precisions.append((np.eye(3) - along) / PRIOR_SCALE_UT**2 + along / PRIOR_VERTICAL_SCALE_UT**2)
-    return precisions
+def _prior_precision(up_body: Array) -> Array:
+    """(3, 3) of a Gaussian of the prior's scales: tighter along the mean vertical up_body (3,) than across."""
+    along = np.outer(up_body, up_body) / (up_body @ up_body)
+    return np.asarray((np.eye(3) - along) / PRIOR_SCALE_UT**2 + along / PRIOR_VERTICAL_SCALE_UT**2)
 
 
 def _solve(design: Array, difference_uT: Array, priors: Sequence[Array]) -> tuple[Array, Array]:
@@ -219,5 +228,4 @@ def _solve(design: Array, difference_uT: Array, priors: Sequence[Array]) -> tupl
         size = np.sum((bias * (prior @ bias)).reshape(-1, 3), axis=1)
         shrink = np.repeat((PRIOR_FREEDOM + 3.0) / (PRIOR_FREEDOM + size), 3)
         bias = np.linalg.solve(tied + shrink * prior, right)
-    widest = (PRIOR_FREEDOM - 2.0) / PRIOR_FREEDOM
-    return bias, np.linalg.inv(tied + np.minimum(shrink, widest) * prior)
+    return bias, np.linalg.inv(tied + np.minimum(shrink, WIDEST) * prior)

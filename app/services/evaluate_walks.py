@@ -8,7 +8,7 @@ one thread.
 
 import gzip
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
@@ -21,13 +21,15 @@ from threadpoolctl import threadpool_limits
 
 from app.errors import Fault, InvalidInput, UnreadableSurvey
 from app.field.fit import fit_map
+from app.field.grid import FieldGrid
 from app.field.samples import Samples
-from app.field.session_bias import SessionBias, estimate_session_biases, remove_session_biases
-from app.field.spec import FittedMap, MapSpec, Score
+from app.field.session_bias import SessionBias, estimate_session_biases, remove_session_biases, unmet_session
+from app.field.spec import FittedMap, MapSpec, Noise, Score
 from app.geometry import Array, rotate_by_quaternion
 from app.positioning.fix import Fix, LocateOptions
 from app.positioning.locate import SearchableFloor, locate, prepare_floor, prepare_floors
 from app.positioning.window import Composition, Window
+from app.services.map_scores import Estimate, HeldOutWalk, MapScore, held_out_walk, nlpd_gain, score_map
 from app.survey.read import read_survey
 from app.survey.walk import DeadReckoning, Walk
 
@@ -40,6 +42,7 @@ HELD_OUT_EVERY = 5
 COVERED_WITHIN_M = 1.5
 COVERED_SHARE = 0.8
 SENSOR_NOISE_UT = 0.5
+NOISES: tuple[Noise, ...] = ("walk", "white")
 WALK_SUFFIXES = (".txt", ".txt.gz")
 MAX_WALK_BYTES = 64 * 2**20
 
@@ -101,7 +104,11 @@ class JudgedWindow:
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFloor:
-    """One floor's map: its walks, its own score, and its score on the walks that were held out."""
+    """One floor's map: its walks, its own score, and its score on the walks that were held out.
+
+    held_out_white: of a map of the same walks that takes all errors to be white. nlpd_gain_over_white: how much lower
+    the held-out NLPD is than that map's.
+    """
 
     floor_id: str
     mapping_walks: tuple[str, ...]
@@ -109,7 +116,9 @@ class EvaluatedFloor:
     components: tuple[str, ...]
     leave_one_out: Score | None
     leave_one_out_reason: str | None
-    held_out: Score | None
+    held_out: MapScore | None
+    held_out_white: MapScore | None
+    nlpd_gain_over_white: Estimate | None
     hyperparameters: Mapping[str, object]
 
 
@@ -127,14 +136,18 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
     floors, unreadable = _read_floors(directory, told)
     if plan.rehearse:
         floors = {floor_id: {name: walks[name] for name in hold_out(walks)[0]} for floor_id, walks in floors.items()}
+    biases: dict[str, dict[str, SessionBias] | None] = dict.fromkeys(floors)
     if plan.session_bias:
-        floors = {floor_id: calibrate_sessions(walks) for floor_id, walks in floors.items()}
+        biases = {floor_id: _mapping_biases(walks) for floor_id, walks in floors.items()}
+        floors = {floor_id: calibrate_sessions(walks, biases[floor_id] or {}) for floor_id, walks in floors.items()}
     with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=_one_thread) as pool:
         fits = {
-            pool.submit(_fit_floor, {name: walks[name].samples for name in hold_out(walks)[0]}, plan.spec): floor_id
+            pool.submit(_fit_floor, _mapping_samples(walks), replace(plan.spec, noise=noise)): (floor_id, noise)
             for floor_id, walks in floors.items()
+            for noise in NOISES
         }
-        fitted = dict(_collected(fits, told, "fitting maps"))
+        by_noise = dict(_collected(fits, told, "fitting maps"))
+    fitted = {floor_id: by_noise[floor_id, plan.spec.noise] for floor_id in floors}
     tasks = [
         (floor_id, name, floors[floor_id][name], _mapped_places(floors[floor_id]))
         for floor_id in floors
@@ -144,7 +157,10 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
     with ProcessPoolExecutor(plan.processes, get_context("spawn"), _ready_to_locate, arguments) as pool:
         judged = dict(_collected({pool.submit(_judge_walk, *task): task[:2] for task in tasks}, told, "locating"))
     return Evaluation(
-        floors=tuple(_evaluated_floor(floor_id, floors[floor_id], fitted[floor_id]) for floor_id in floors),
+        floors=tuple(
+            _evaluated_floor(floor_id, walks, fitted[floor_id], by_noise[floor_id, "white"], biases[floor_id])
+            for floor_id, walks in floors.items()
+        ),
         windows=tuple(window for key in sorted(judged) for window in judged[key]),
         unreadable=unreadable,
     )
@@ -157,10 +173,8 @@ def hold_out(walks: Mapping[str, object]) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in set(held_out)], held_out
 
 
-def calibrate_sessions(walks: Mapping[str, Walk]) -> dict[str, Walk]:
-    """The walks of a floor without the offset of their calibration session, as the walks to map show it."""
-    mapping, _ = hold_out(walks)
-    biases = estimate_session_biases({name: walks[name].samples for name in mapping})
+def calibrate_sessions(walks: Mapping[str, Walk], biases: Mapping[str, SessionBias]) -> dict[str, Walk]:
+    """The walks of a floor without the offset of their calibration session."""
     samples = remove_session_biases({name: walk.samples for name, walk in walks.items()}, biases)
     return {
         name: replace(walk, samples=samples[name], dead_reckoning=_calibrated(walk, biases))
@@ -326,13 +340,36 @@ def _judge(
     )
 
 
+def _mapping_biases(walks: Mapping[str, Walk]) -> dict[str, SessionBias]:
+    """The offsets of the calibration sessions, as the walks to map show them."""
+    return estimate_session_biases({name: walks[name].samples for name in hold_out(walks)[0]})
+
+
+def _mapping_samples(walks: Mapping[str, Walk]) -> dict[str, Samples]:
+    """The walks to map. Their sessions' offsets are out already, or shall stay in: the fit is not told of them."""
+    return {name: replace(walks[name].samples, session=None) for name in hold_out(walks)[0]}
+
+
 def _mapped_places(walks: Mapping[str, Walk]) -> Array:
     """(n, 2) positions of all mapping walks of a floor."""
     return np.concatenate([walks[name].samples.p_building_m[:, :2] for name in hold_out(walks)[0]])
 
 
-def _evaluated_floor(floor_id: str, walks: Mapping[str, Walk], fitted: FittedMap) -> EvaluatedFloor:
+def _evaluated_floor(
+    floor_id: str,
+    walks: Mapping[str, Walk],
+    fitted: FittedMap,
+    white: FittedMap,
+    biases: Mapping[str, SessionBias] | None,
+) -> EvaluatedFloor:
     mapping, held_out = hold_out(walks)
+    mapped_m = _mapped_places(walks)
+
+    def against(grid: FieldGrid) -> list[HeldOutWalk]:
+        samples = [walks[name].samples for name in held_out]
+        return [held_out_walk(grid, each, mapped_m, _session_of(each, biases)) for each in samples]
+
+    judged, judged_white = against(fitted.grid), against(white.grid)
     return EvaluatedFloor(
         floor_id=floor_id,
         mapping_walks=tuple(mapping),
@@ -340,26 +377,15 @@ def _evaluated_floor(floor_id: str, walks: Mapping[str, Walk], fitted: FittedMap
         components=fitted.grid.component_names,
         leave_one_out=fitted.score,
         leave_one_out_reason=fitted.score_reason,
-        held_out=_held_out_score(fitted, [walks[name].samples for name in held_out]),
+        held_out=score_map(judged),
+        held_out_white=score_map(judged_white),
+        nlpd_gain_over_white=nlpd_gain(judged, judged_white),
         hyperparameters=fitted.hyperparameters,
     )
 
 
-def _held_out_score(fitted: FittedMap, walks: Sequence[Samples]) -> Score | None:
-    """The map against walks it never saw, where it is measured; predictive sd includes the noise."""
-    errors, deviations = [], []
-    for samples in walks:
-        predicted = fitted.grid.at(samples.p_building_m)
-        error_uT = samples.features(fitted.grid.components) - predicted.mean_uT
-        errors.append(error_uT[predicted.measured])
-        deviations.append(np.hypot(predicted.sd_uT, fitted.grid.noise_sd_uT)[predicted.measured])
-    error_uT, sd_uT = np.concatenate(errors), np.concatenate(deviations)
-    if not len(error_uT):
+def _session_of(samples: Samples, biases: Mapping[str, SessionBias] | None) -> SessionBias | None:
+    """What is known of the walk's session; None where nothing was taken out of any."""
+    if biases is None or samples.session is None or samples.q_body_to_building is None:
         return None
-    z = error_uT / sd_uT
-    return Score(
-        rmse_ut=tuple(np.sqrt(np.mean(np.square(error_uT), axis=0)).tolist()),
-        coverage_2sigma=tuple(np.mean(np.abs(z) <= 2.0, axis=0).tolist()),
-        nlpd=float(np.mean(0.5 * np.log(2 * np.pi) + np.log(sd_uT) + 0.5 * np.square(z))),
-        held_out_samples=len(error_uT),
-    )
+    return biases.get(samples.session) or unmet_session(samples)
