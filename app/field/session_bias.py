@@ -113,7 +113,7 @@ def unmet_session(samples: Samples) -> SessionBias:
     """What is expected of the offset of a session that no other walk shares: none, with the prior's covariance."""
     assert samples.q_body_to_building is not None
     up = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()[:, 2].mean(axis=0)
-    return SessionBias(np.zeros(3), np.linalg.inv(WIDEST * _prior_precision(up)))
+    return SessionBias(np.zeros(3), np.asarray(np.linalg.inv(WIDEST * _prior_precision(up))))
 
 
 def offset_variance_uT2(samples: Samples, bias: SessionBias, components: Components) -> Array:

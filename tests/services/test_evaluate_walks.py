@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from app.cli import evaluate as command
 from app.errors import InvalidInput
 from app.field.samples import Samples
+from app.field.session_bias import estimate_session_biases
 from app.services.evaluate_walks import (
     Evaluation,
     EvaluationPlan,
@@ -98,7 +99,16 @@ def test_a_known_building_is_evaluated_end_to_end(building, tmp_path):
                          "--processes", "1", "--json", str(report)],
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    for words in ("each left out", "held-out walks", "right floor", "truth in 95 % radius", "broken.txt", "cut.txt.gz"):
+    for words in (
+        "each survey left out",
+        "held-out walks",
+        "robust sd",
+        "gain",
+        "right floor",
+        "truth in 95 % radius",
+        "broken.txt",
+        "cut.txt.gz",
+    ):
         assert words in result.output
     document = json.loads(report.read_text())
     windows = document["evaluation"]["windows"]
@@ -109,6 +119,8 @@ def test_a_known_building_is_evaluated_end_to_end(building, tmp_path):
     assert np.mean([w["ml"]["right_floor"] and w["ml"]["error_m"] < 2.0 for w in long]) > 0.7
     for floor in document["evaluation"]["floors"]:
         assert max(floor["held_out"]["rmse_ut"]) < 4.0
+        assert floor["held_out"]["robust_sd_ut"][0]["value"] < 4.0
+        assert np.isfinite(floor["nlpd_gain_over_white"]["value"])
         assert not set(floor["mapping_walks"]) & set(floor["held_out_walks"])
     assert len(document["summaries"]) == 4
 
@@ -191,7 +203,8 @@ def test_session_offsets_are_taken_out_of_samples_and_dead_reckoning_alike():
         n = len(p)
         dead = DeadReckoning(p, np.zeros(n), level, np.tile(level_q, (n, 1)), along, along, None, None, 4.0)
         walks[f"{k:02d}"] = Walk(samples, {"heading": heading}, dead)
-    for walk in calibrate_sessions(walks).values():
+    biases = estimate_session_biases({name: walk.samples for name, walk in walks.items()})
+    for walk in calibrate_sessions(walks, biases).values():
         np.testing.assert_allclose(walk.samples.B_uT, np.tile([1.0, 27.0, -40.0], (80, 1)), atol=0.5)
         turned = Rotation.from_euler("z", walk.report["heading"]).apply(walk.dead_reckoning.B_level_uT)
         np.testing.assert_allclose(turned, walk.samples.B_uT, atol=1e-9)
