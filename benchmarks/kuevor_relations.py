@@ -6,8 +6,9 @@ white noise of 0.12 uT, which together give the RMSE he has on a flight's own da
 without offsets in 0.27 uT. Maps are squared-exponential and exact, hyper-parameters learned from every third
 observation. A compromise map is told as noisy observations ("seed's") or with covariance ("ours").
 
-Noise, offsets and what "flat" means were settled after seeing results of rooms 1 to 3; name others to see whether the relations hold there.
-Relations that hold only on the mean, or of an improved variant, stand beside the strict ones, which are not required.
+Noise, offsets and what "flat" means were settled after seeing results of rooms 1 to 3; name others to see whether the
+relations hold there. Relations that hold only on the mean, or of an improved variant, stand beside the strict ones,
+which are not required.
 
     python benchmarks/kuevor_relations.py [room ...]        exits 1 when a required relation is missed
 """
