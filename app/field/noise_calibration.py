@@ -9,6 +9,7 @@ as much of them as a Gaussian should (Kuevor B14 asks the same of every log); ea
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.geometry import Array
 
@@ -35,8 +36,36 @@ def noise_sd_shown(needed_uT2: Sequence[Array], believed_sd_uT: Array) -> Array:
 
 
 def noise_sd_by_survey(needed_uT2: Mapping[str, Array], believed_sd_uT: Array) -> dict[str, Array]:
-    """Survey id -> (c,) noise sd that the other surveys show."""
-    return {
-        survey_id: noise_sd_shown([n for other, n in needed_uT2.items() if other != survey_id], believed_sd_uT)
-        for survey_id in needed_uT2
-    }
+    """Survey id -> (c,) noise sd that the other surveys show, of one sort for all surveys."""
+    judged = {survey_id: needed for survey_id, needed in needed_uT2.items() if len(needed)}
+    if not judged:
+        return dict.fromkeys(needed_uT2, believed_sd_uT)
+    everything = np.sort(np.concatenate(list(judged.values())), axis=0)
+    least_uT2 = np.square(LEAST_SHARE * believed_sd_uT)
+    shown = {}
+    for survey_id in needed_uT2:
+        own = judged.get(survey_id, everything[:0])
+        if len(judged) - (len(own) > 0) < FEWEST_SURVEYS or len(everything) - len(own) < FEWEST_SAMPLES:
+            shown[survey_id] = believed_sd_uT
+            continue
+        columns = zip(everything.T, own.T, strict=True)
+        variance_uT2 = np.array([_quantile_without(NOMINAL_COVERAGE, *both) for both in columns])
+        shown[survey_id] = np.sqrt(np.maximum(variance_uT2, least_uT2))
+    return shown
+
+
+def _quantile_without(share: float, everything: Array, own: Array) -> float:
+    """The quantile of the sorted values (n,) but for `own` (m,), which are among them."""
+    taken = np.searchsorted(everything, np.sort(own)) + _repeats(np.sort(own))
+    rank = share * (len(everything) - len(own) - 1)
+    below = int(rank)
+    # The k-th of the others lies as many places further on as own ones lie before it.
+    places = [k + int(np.searchsorted(taken - np.arange(len(taken)), k, side="right")) for k in (below, below + 1)]
+    low, high = everything[np.minimum(places, len(everything) - 1)]
+    return float(low + (rank - below) * (high - low))
+
+
+def _repeats(ordered: Array) -> NDArray[np.int64]:
+    """(m,) how many equal values stand before each of the sorted ones."""
+    first = np.searchsorted(ordered, ordered)
+    return np.asarray(np.arange(len(ordered)) - first)

@@ -33,3 +33,13 @@ def test_sparse_surveys_do_not_talk_the_noise_away():
     overstated = {name: n - 2.0 for name, n in needed(np.random.default_rng(0), 1.0).items()}
     shown = noise_sd_shown(list(overstated.values()), BELIEVED)
     assert shown == pytest.approx(LEAST_SHARE * BELIEVED)
+
+
+def test_the_noise_for_a_survey_is_what_the_others_show_alone():
+    rng = np.random.default_rng(3)
+    needed = {str(k): np.round(rng.normal(1.0, 1.0, (n, 2)), 1) for k, n in enumerate((300, 1, 0, 450, 120, 80))}
+    believed = np.array([0.5, 0.1])
+    by_survey = noise_sd_by_survey(needed, believed)
+    for survey_id, sd in by_survey.items():
+        alone = noise_sd_shown([n for other, n in needed.items() if other != survey_id], believed)
+        assert np.allclose(sd, alone, rtol=1e-12), survey_id
