@@ -48,7 +48,10 @@ def lawnmower(
     each = int(np.ceil(samples / lanes))
     u = np.linspace(0.0, 1.0, each)
     unit = np.concatenate(
-        [np.column_stack([u if k % 2 == 0 else u[::-1], np.full(each, (k + rng.random()) / lanes)]) for k in range(lanes)]
+        [
+            np.column_stack([u if k % 2 == 0 else u[::-1], np.full(each, (k + rng.random()) / lanes)])
+            for k in range(lanes)
+        ]
     )[:samples]
     if rng.random() < 0.5:
         unit = unit[:, ::-1]
@@ -87,7 +90,10 @@ def main() -> int:
         walks = surveys(samples, AREA_M2)
         elapsed_s, fitted = timed(walks)
         times_s.append(elapsed_s)
-        print(f"{samples:9,d} samples on {AREA_M2:,.0f} m2: {elapsed_s:7.2f} s, {len(fitted.state.tiles)} tiles", flush=True)
+        print(
+            f"{samples:9,d} samples on {AREA_M2:,.0f} m2: {elapsed_s:7.2f} s, {len(fitted.state.tiles)} tiles",
+            flush=True,
+        )
     full_s, whole = times_s[-1], fitted
     grown = exponent(SAMPLES, times_s)
     steepest = max(np.diff(np.log(times_s)) / np.diff(np.log(SAMPLES)))
@@ -99,7 +105,9 @@ def main() -> int:
 
     for what, side_m in (("a patch of 12 x 12 m", 12.0), ("a patch of 25 x 25 m", 25.0)):
         rng = np.random.default_rng(99)
-        more = lawnmower(rng, Waves(np.random.default_rng(7)), np.array([40.0, 40.0]), np.full(2, side_m), SURVEY_SAMPLES)
+        more = lawnmower(
+            rng, Waves(np.random.default_rng(7)), np.array([40.0, 40.0]), np.full(2, side_m), SURVEY_SAMPLES
+        )
         added_s, added = timed(walks | {"zz": more}, whole.state)
         print(
             f"one more survey of {SURVEY_SAMPLES:,} samples, {what}: {added_s:.2f} s = {added_s / full_s:.1%} of the fit,"

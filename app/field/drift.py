@@ -30,6 +30,7 @@ __all__ = ["BLOCK_M", "FAMILY_CHANCE", "out_of_date_regions"]
 
 BLOCK_M = 3.0
 STEP_M = 1.5
+LEAST_VARIANCE_UT2 = 1e-6
 """Blocks overlap by half, or a magnet in the middle of one, whose field points both ways, would go unseen."""
 OVERLAP = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
 FAMILY_CHANCE = 0.01
@@ -127,7 +128,7 @@ def _judge(rows: _Table) -> _Verdict | None:
     n = len(rows.rank)
     if n <= FEWEST_OLDER:
         return None
-    weight = 1.0 / np.square(rows.sd_uT)
+    weight = 1.0 / np.maximum(np.square(rows.sd_uT), LEAST_VARIANCE_UT2)
     moments = np.cumsum(np.stack([weight, weight * rows.error_uT, weight * rows.error_uT**2]), axis=1)
     older = moments[:, FEWEST_OLDER - 1 : -1]  # (3, splits, c)
     recent = moments[:, -1:] - older

@@ -24,7 +24,7 @@ __all__ = ["estimate_by_hilbert"]
 
 RELEARN = 2.0
 """What was learned is learned anew when there are this many times more, or fewer, observations."""
-FLAT_M = 0.4
+FLAT_M = 0.8
 """Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
 
 
