@@ -25,7 +25,7 @@ PITCHES_M = (
     *(1.0, 1.12, 1.25, 1.4, 1.6, 1.8, 2.0, 2.24, 2.5, 2.8, 3.15, 3.55, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0),
     *(10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0, 22.4, 25.0, 28.0, 31.5, 40.0, 63.0, 100.0),
 )
-PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.15}
+PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.1}
 WIDE_PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
 """A rough kernel has detail finer than its length and wants functions packed closer than a smooth one. Small tiles
 cost least; only wide ones can tell a long length, or a survey's offset in the tile, from a large field."""
