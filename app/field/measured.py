@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
 
 from app.field.estimate import FieldEstimate
-from app.field.observations import Walk
+from app.field.observations import Walk, walk_bounds
 from app.field.raster import GridFrame
 from app.field.tiles import REACH_M
 from app.geometry import Array
@@ -56,18 +56,39 @@ def _near_columns(frame: GridFrame, position_m: Array, resolution_m: float, reac
 
 def near_other_walks(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[np.bool_]]:
     """Survey id -> (N,) samples within REACH_M of an observation of another survey; heights count in a volume."""
-    axes = 3 if volume else 2
-    trees = {walk.survey_id: cKDTree(walk.position_m[:, :axes]) for walk in walks}
-    boxes = {name: (tree.mins - REACH_M, tree.maxes + REACH_M) for name, tree in trees.items()}
-    near: dict[str, NDArray[np.bool_]] = {}
-    for walk in walks:
-        points = walk.position_m[:, :axes]
-        close = np.zeros(len(points), dtype=np.bool_)
-        for other in walks:
-            low, high = boxes[other.survey_id]
-            asked = np.flatnonzero(~close & np.all((points >= low) & (points <= high), axis=1))
-            if other is not walk and len(asked):
-                distance_m, _ = trees[other.survey_id].query(points[asked], distance_upper_bound=REACH_M)
-                close[asked] = np.isfinite(distance_m)
-        near[walk.survey_id] = close[walk.stretch_of_sample]
+    position_m = np.concatenate([walk.position_m for walk in walks])
+    if not volume:
+        position_m = position_m * [1.0, 1.0, 0.0]
+    survey = np.repeat(np.arange(len(walks)), [len(walk) for walk in walks])
+    cell = np.floor(position_m[:, :2] / REACH_M).astype(np.int64)
+    cell -= cell.min(axis=0)
+    rows = int(cell[:, 1].max()) + 3
+    key = (cell[:, 0] + 1) * rows + cell[:, 1] + 1
+    order = np.argsort(key, kind="stable")
+    close = np.empty(len(key), dtype=np.bool_)
+    close[order] = _near_others(position_m[order], survey[order], key[order], rows, REACH_M**2)
+    parts = np.split(close, walk_bounds(walks)[1:-1])
+    return {walk.survey_id: part[walk.stretch_of_sample] for walk, part in zip(walks, parts, strict=True)}
+
+
+@njit(cache=True)
+def _near_others(
+    position_m: Array, survey: NDArray[np.int64], key: NDArray[np.int64], rows: int, reach_m2: float
+) -> NDArray[np.bool_]:
+    """Points sorted by the key of their cell, one reach wide; looked for in the nine cells around."""
+    near = np.zeros(len(key), dtype=np.bool_)
+    for i in range(len(key)):
+        for column in range(-1, 2):
+            first = np.searchsorted(key, key[i] + column * rows - 1)
+            last = np.searchsorted(key, key[i] + column * rows + 1, side="right")
+            for j in range(first, last):
+                if survey[j] != survey[i]:
+                    squared = 0.0
+                    for axis in range(3):
+                        squared += (position_m[j, axis] - position_m[i, axis]) ** 2
+                    if squared <= reach_m2:
+                        near[i] = True
+                        break
+            if near[i]:
+                break
     return near

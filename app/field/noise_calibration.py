@@ -40,15 +40,15 @@ def noise_sd_by_survey(needed_uT2: Mapping[str, Array], believed_sd_uT: Array) -
     judged = {survey_id: needed for survey_id, needed in needed_uT2.items() if len(needed)}
     if not judged:
         return dict.fromkeys(needed_uT2, believed_sd_uT)
-    everything = np.sort(np.concatenate(list(judged.values())), axis=0)
+    everything = np.sort(np.concatenate(list(judged.values())).T.copy())  # (c, n): rows are searched
     least_uT2 = np.square(LEAST_SHARE * believed_sd_uT)
     shown = {}
     for survey_id in needed_uT2:
-        own = judged.get(survey_id, everything[:0])
-        if len(judged) - (len(own) > 0) < FEWEST_SURVEYS or len(everything) - len(own) < FEWEST_SAMPLES:
+        own = judged.get(survey_id, needed_uT2[survey_id])
+        if len(judged) - (len(own) > 0) < FEWEST_SURVEYS or everything.shape[1] - len(own) < FEWEST_SAMPLES:
             shown[survey_id] = believed_sd_uT
             continue
-        columns = zip(everything.T, own.T, strict=True)
+        columns = zip(everything, own.T, strict=True)
         variance_uT2 = np.array([_quantile_without(NOMINAL_COVERAGE, *both) for both in columns])
         shown[survey_id] = np.sqrt(np.maximum(variance_uT2, least_uT2))
     return shown
