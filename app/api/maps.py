@@ -54,6 +54,9 @@ class NewMap(RequestModel):
     noise: Annotated[
         Noise, Field(description="walk: errors along a walk may be correlated, as far as the data say so; white: never")
     ] = "walk"
+    hard_iron: Annotated[
+        bool, Field(description="take the sensors' own constant field out of surveys that know their orientation")
+    ] = True
     robust: Annotated[bool, Field(description="heavy-tailed errors: stray readings count less")] = False
     resolution_m: Annotated[Finite, Field(ge=0.05, le=5.0)] = 0.25
     heights_m: Annotated[

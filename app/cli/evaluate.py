@@ -55,7 +55,7 @@ def evaluate(
             raise typer.BadParameter(f"{value} is not one of {', '.join(known)}", param_hint=f"--{name}")
     plan = EvaluationPlan(
         window_lengths_m=tuple(lengths_m),
-        spec=MapSpec(components=components, resolution_m=resolution_m),  # type: ignore[arg-type]
+        spec=MapSpec(components=components, resolution_m=resolution_m, hard_iron=False),  # type: ignore[arg-type]
         composition=composition,  # type: ignore[arg-type]
         session_bias=session_bias,
         rehearse=rehearse,

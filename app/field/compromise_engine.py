@@ -17,6 +17,7 @@ from app.field.exact import (
     estimate_of,
     learn_components,
 )
+from app.field.hard_iron import Cleaned
 from app.field.observations import Walk
 from app.field.spec import MapSpec, Progress
 from app.field.tile_fit import FitState
@@ -36,6 +37,7 @@ LEAST_NOISE_UT = 0.01
 
 def estimate_by_compromise(
     walks: Sequence[Walk],
+    cleaned: Cleaned,
     spec: MapSpec,
     previous: FitState | None,
     progress: Progress,
@@ -48,7 +50,7 @@ def estimate_by_compromise(
     Of more observations than MAX_OBSERVATIONS that many are used, evenly spaced along the walks; `observations_used`
     says how many. with_covariance: False for the seed's method. spacing_m: of the nodes; None for half the shortest
     length, or less, so that the means agree. Where there would be more than MAX_NODES they lie farther apart.
-    `previous` is not made use of. Raises InvalidInput for a sum of kernels.
+    `cleaned` and `previous` are not made use of. Raises InvalidInput for a sum of kernels.
     """
     everything = Observations.of(walks)
     observations = everything[_evenly(len(everything), MAX_OBSERVATIONS)]

@@ -22,7 +22,8 @@ class FieldEstimate:
     error_sd_uT (c,): of one observation about the latent field
     held_out_mean_uT (n, c), held_out_variance_ratio (n, c) or (n, 1): each survey's observations, by survey id,
     predicted from all the other surveys
-    state: what the next fit can start from; tiles_refitted of all tiles, for a report
+    state: what the next fit can start from; tiles_refitted of all tiles; continued: with what an earlier
+    fit had learned
     """
 
     frame: GridFrame
@@ -37,6 +38,7 @@ class FieldEstimate:
     hyperparameters: dict[str, object]
     state: FitState | None = None
     tiles_refitted: int = 0
+    continued: bool = False
 
 
 def ambient_field_uT(walks: Sequence[Walk]) -> Array:

@@ -16,6 +16,7 @@ from scipy.spatial.distance import cdist
 
 from app.errors import InvalidInput
 from app.field.estimate import FieldEstimate, ambient_field_uT
+from app.field.hard_iron import Cleaned
 from app.field.kernels import MATERN_SMOOTHNESS, base_kernel, covariance, covariance_slope, is_sum
 from app.field.observations import Walk
 from app.field.raster import GridFrame, layer_heights_m
@@ -141,11 +142,11 @@ Conditioned = Callable[[Observations], list[ExactPosterior]]
 
 
 def estimate_by_exact(
-    walks: Sequence[Walk], spec: MapSpec, previous: FitState | None, progress: Progress
+    walks: Sequence[Walk], cleaned: Cleaned, spec: MapSpec, previous: FitState | None, progress: Progress
 ) -> FieldEstimate:
     """The exact posterior of every component; surveys left out by honest refits at the same hyper-parameters.
 
-    `previous` is not made use of. Raises InvalidInput above MAX_OBSERVATIONS, and for a sum of kernels.
+    `cleaned` and `previous` are not made use of. Raises InvalidInput above MAX_OBSERVATIONS, and for a sum of kernels.
     """
     observations = Observations.of(walks)
     if len(observations) > MAX_OBSERVATIONS:

@@ -13,6 +13,7 @@ from app.field.drift import out_of_date_regions
 from app.field.estimate import FieldEstimate
 from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
+from app.field.hard_iron import Cleaned, HardIron, remove_hard_iron
 from app.field.hilbert_engine import estimate_by_hilbert
 from app.field.leave_one_out import HeldOut, error_correlation_m, score
 from app.field.measured import measured_cells, near_other_walks
@@ -25,12 +26,16 @@ from app.geometry import Array
 
 __all__ = ["fit_map"]
 
-_Estimator = Callable[[Sequence[Walk], MapSpec, FitState | None, Progress], FieldEstimate]
+_Estimator = Callable[[Sequence[Walk], Cleaned, MapSpec, FitState | None, Progress], FieldEstimate]
 _ENGINES: dict[Engine, _Estimator] = {
     "hilbert": estimate_by_hilbert,
     "exact": estimate_by_exact,
     "compromise": estimate_by_compromise,
 }
+
+
+RELEARN = 2.0
+"""What was learned is learned anew when there are this many times more, or fewer, samples."""
 
 
 def _silent(fraction: float, message: str) -> None:
@@ -53,8 +58,13 @@ def fit_map(
     """
     _check(spec)
     progress(0.0, "reading the walks")
-    observed = observe(walks, spec.components)
-    estimate = _ENGINES[spec.engine](observed, spec, previous, lambda f, text: progress(0.9 * f, text))
+    if previous is not None and not _about_as_many(previous.learned.samples, sum(map(len, walks.values()))):
+        previous = None
+    cleaned = Cleaned(walks, HardIron(), {})
+    if spec.hard_iron:
+        cleaned = remove_hard_iron(walks, spec.components, previous.hard_iron if previous else HardIron())
+    observed = observe(cleaned.walks, spec.components)
+    estimate = _ENGINES[spec.engine](observed, cleaned, spec, previous, lambda f, text: progress(0.9 * f, text))
     progress(0.9, "scoring the map by leaving each survey out")
     held_out, noise_sd_uT = _held_out(observed, estimate)
     correlation_m = error_correlation_m(held_out)
@@ -70,7 +80,14 @@ def fit_map(
         out_of_date=out_of_date_regions(observed, held_out, sorted(walks), names, correlation_m),
         state=estimate.state,
         tiles_refitted=estimate.tiles_refitted,
+        continued=estimate.continued,
+        hard_iron=cleaned.hard_iron.as_json(),
     )
+
+
+def _about_as_many(learned_from: int, now: int) -> bool:
+    """Whether what was learned from so many samples still serves."""
+    return learned_from / RELEARN <= now <= learned_from * RELEARN
 
 
 def _check(spec: MapSpec) -> None:

@@ -5,10 +5,12 @@ taken from there. Adding, leaving out or deleting a survey so costs the tiles it
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from app.field.estimate import FieldEstimate, ambient_field_uT
+from app.field.hard_iron import Cleaned
 from app.field.learning import learn
 from app.field.leave_one_out import HeldOutPrediction
 from app.field.observations import Walk
@@ -17,29 +19,28 @@ from app.field.raster import Blended, GridFrame, blend, layer_heights_m
 from app.field.spec import MapSpec, Progress
 from app.field.tile_fit import FitState, Learned, TileFit, fit_tile
 from app.field.tiled_walks import TiledWalks
-from app.field.tiles import Lattice, Tile
+from app.field.tiles import Lattice, Slab, Tile
 from app.geometry import Array
 
 __all__ = ["estimate_by_hilbert"]
 
-RELEARN = 2.0
-"""What was learned is learned anew when there are this many times more, or fewer, observations."""
 FLAT_M = 0.8
 """Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
 
 
 def estimate_by_hilbert(
-    walks: Sequence[Walk], spec: MapSpec, previous: FitState | None, progress: Progress
+    walks: Sequence[Walk], cleaned: Cleaned, spec: MapSpec, previous: FitState | None, progress: Progress
 ) -> FieldEstimate:
     """The blended field of all tiles, and the walks predicted by subtraction. Raises InvalidInput for a huge grid."""
     layers_m = layer_heights_m(walks, spec)
     slab_m = _slab(walks, spec, layers_m)
-    if previous is not None and _still_good(previous.learned, walks, slab_m):
+    if previous is not None and _fits(previous.learned.lattice.slab, slab_m):
         learned = previous.learned
     else:
         previous = None
         ambient_uT = ambient_field_uT(walks)
         learned = learn(walks, ambient_uT, spec, slab_m, lambda f, message: progress(0.4 * f, message))
+    learned = _with_offsets(learned, cleaned.offset_variance_uT2)
     old = previous.tiles if previous is not None and np.array_equal(previous.heights_m, layers_m) else {}
     lattice, hyper = learned.lattice, learned.hyper
     frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, layers_m)
@@ -69,7 +70,8 @@ def estimate_by_hilbert(
         held_out_mean_uT=predicted.mean_uT,
         held_out_variance_ratio=predicted.variance_ratio,
         hyperparameters=hyper.as_json() | {"tile_pitch_m": lattice.pitch_m},
-        state=FitState(learned, layers_m, tiles),
+        state=FitState(learned, layers_m, cleaned.hard_iron, tiles),
+        continued=previous is not None,
         tiles_refitted=sum(fit is not old.get(tile) for tile, fit in tiles.items()),
     )
 
@@ -82,6 +84,13 @@ def _blend(lattice: Lattice, frame: GridFrame, spec: MapSpec, tiles: Mapping[Til
     return blend_potentials(lattice, frame, spec.resolution_m, patches, borders)
 
 
+def _with_offsets(learned: Learned, offset_variance_uT2: Mapping[str, Array]) -> Learned:
+    """With what may be left of every sensor's own field, beside the signal."""
+    signal_uT2 = float(np.mean(np.square(learned.hyper.signal_sd_uT)))
+    ratio = {name: float(np.mean(variance)) / signal_uT2 for name, variance in sorted(offset_variance_uT2.items())}
+    return replace(learned, hyper=replace(learned.hyper, offset_ratio=ratio))
+
+
 def _slab(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> tuple[float, float] | None:
     """The heights between which the field is wanted or was measured; None when a plane will do."""
     z_m = np.concatenate([walk.position_m[:, 2] for walk in walks])
@@ -92,12 +101,8 @@ def _slab(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> tuple[float,
     return float(everything.min()), float(everything.max())
 
 
-def _still_good(learned: Learned, walks: Sequence[Walk], slab_m: tuple[float, float] | None) -> bool:
-    """Whether what was learned still serves: about as many observations, within the heights it was made for."""
-    observations = sum(map(len, walks))
-    if not learned.observations / RELEARN <= observations <= learned.observations * RELEARN:
-        return False
-    slab = learned.lattice.slab
+def _fits(slab: Slab | None, slab_m: tuple[float, float] | None) -> bool:
+    """Whether tiles that were made for a plane, or for some heights, serve these."""
     if slab is None or slab_m is None:
         return slab is None and slab_m is None
     return slab.inner_m[0] <= slab_m[0] and slab_m[1] <= slab.inner_m[1]

@@ -27,6 +27,7 @@ class Hyperparameters:
 
     bias_ratio, walk_ratio, white_ratio: variances of a survey's offset in a tile, of the error correlated along the
     walk and of the white error, over the signal's. r is the distance between places, s the distance walked.
+    offset_ratio: survey id -> variance, over the signal's, of what may be left of its sensor's own constant field.
     short_length_m, short_share: of the second kernel of a sum. noise_scale: survey id -> factor on the variances of its
     walk and white error; 1 for those not named.
     """
@@ -41,6 +42,7 @@ class Hyperparameters:
     short_length_m: float | None = None
     short_share: float = 0.0
     noise_scale: Mapping[str, float] = field(default_factory=dict)
+    offset_ratio: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -81,6 +83,9 @@ class Hyperparameters:
         """Of white error as the functions of a tile see it, detail included."""
         own = self.white_ratio if isinstance(basis, SlabBasis) else self.white_ratio + self.detail_ratio(basis)
         return own * self.noise_scale.get(survey_id, 1.0)
+
+    def bias_ratio_of(self, survey_id: str) -> float:
+        return self.bias_ratio + self.offset_ratio.get(survey_id, 0.0)
 
     def source_variance_ratio(self, basis: Basis) -> float:
         """Variance of the divergence allowed in air, over the signal's variance, 1/m^2; only of a potential."""

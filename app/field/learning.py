@@ -128,7 +128,7 @@ def learn(
     else:
         wide = hyper.short_length_m is not None or hyper.bias_ratio + hyper.walk_ratio > LARGE_OFFSET
         lattice = Lattice.for_length(kernel, hyper.finest_length_m, wide)
-    return Learned(hyper, lattice, ambient_uT, sum(map(len, walks)))
+    return Learned(hyper, lattice, ambient_uT, sum(len(walk.sample_field_uT) for walk in walks))
 
 
 def _learn_walk_noise(learner: _Learner, white: _Found, progress: Progress) -> _Found:

@@ -22,6 +22,7 @@ from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from app.field.body_bias import BodyBias
 from app.field.samples import Components, Samples
 from app.geometry import Array, rotate_by_quaternion
 
@@ -116,7 +117,7 @@ def unmet_session(samples: Samples) -> SessionBias:
     return SessionBias(np.zeros(3), np.asarray(np.linalg.inv(WIDEST * _prior_precision(up))))
 
 
-def offset_variance_uT2(samples: Samples, bias: SessionBias, components: Components) -> Array:
+def offset_variance_uT2(samples: Samples, bias: BodyBias | SessionBias, components: Components) -> Array:
     """(n, c) variance that what is unknown of the offset puts into every sample's features, to first order."""
     assert samples.q_body_to_building is not None
     rotation = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()

@@ -55,6 +55,7 @@ class MapSpec:
     heights_m   heights of the layers, rising; None: one layer at the samples' median height
     curl_free   the field is the gradient of a potential, and free of sources where somebody walked (vector maps)
     noise       "walk": errors along a walk may be correlated, as far as the likelihood says; "white": never
+    hard_iron   take the sensors' own constant field out of walks that know their orientation
     robust      heavy-tailed (Student) errors: what disagrees with everything near it counts less
     """
 
@@ -65,6 +66,7 @@ class MapSpec:
     heights_m: tuple[float, ...] | None = None
     curl_free: bool = False
     noise: Noise = "walk"
+    hard_iron: bool = True
     robust: bool = False
 
     @property
@@ -191,3 +193,5 @@ class FittedMap:
     out_of_date: tuple[OutOfDateRegion, ...] = ()
     state: FitState | None = None  # what the next fit with the same parameters can start from
     tiles_refitted: int = 0
+    continued: bool = False  # with what an earlier fit had learned
+    hard_iron: dict[str, object] = field(default_factory=dict)  # the offsets taken out, by session and by survey

@@ -173,7 +173,8 @@ def add_evidence(evidence: Collection[Evidence]) -> Evidence:
 def marginalise(basis: Basis, survey_id: str, survey: SurveyStatistics, hyper: Hyperparameters) -> Evidence:
     """The survey's evidence about the weights in units of the signal variance, its offsets integrated out."""
     white_ratio = hyper.white_ratio_in(basis, survey_id)
-    shrink = hyper.bias_ratio / (white_ratio + hyper.bias_ratio * survey.ones)
+    bias_ratio = hyper.bias_ratio_of(survey_id)
+    shrink = bias_ratio / (white_ratio + bias_ratio * survey.ones)
     target = survey.target - (survey.offsets * shrink) @ survey.ones_target
     table = survey.gram.table / white_ratio
     if survey.sources is not None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from app.field.hard_iron import HardIron
 from app.field.hilbert import Patch, SlabPosterior, posterior, predict
 from app.field.hyperparameters import Hyperparameters
 from app.field.raster import tile_cells
@@ -26,13 +27,13 @@ __all__ = ["FitState", "HeldOutPart", "Learned", "TileFit", "fit_tile"]
 class Learned:
     """What all tiles share: hyper-parameters, the lattice that suits them, the ambient field (c,).
 
-    observations: how many they were learned from.
+    samples: how many they were learned from.
     """
 
     hyper: Hyperparameters
     lattice: Lattice
     ambient_uT: Array
-    observations: int
+    samples: int
 
 
 class HeldOutPart(NamedTuple):
@@ -62,6 +63,7 @@ class FitState:
 
     learned: Learned
     heights_m: Array
+    hard_iron: HardIron
     tiles: Mapping[Tile, TileFit]
 
 

@@ -108,7 +108,7 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
     for sha256 in plan.get("stale_states", []):
         blobs.discard(sha256)
     state = state_to_bytes(fitted.state) if fitted.state else None
-    changes = _changes(plan, fitted, previous)
+    changes = _changes(plan, fitted)
     return {
         "state_sha256": blobs.put(state) if state else None,
         "changes": changes,
@@ -134,14 +134,13 @@ def _previous_state(plan: Plan, components: str, blobs: BlobStore) -> FitState |
         return None
 
 
-def _changes(plan: Plan, fitted: FittedMap, previous: FitState | None) -> Result:
+def _changes(plan: Plan, fitted: FittedMap) -> Result:
     """What this build did beside the map before it."""
     now = {survey_id for survey_id, _, _ in plan["surveys"]}
-    continued = previous is not None and fitted.state is not None and fitted.state.learned is previous.learned
-    before = set(plan["previous"]["survey_ids"]) if continued else set()
+    before = set(plan["previous"]["survey_ids"]) if fitted.continued else set()
     tiles = len(fitted.state.tiles) if fitted.state else 0
     return {
-        "hyperparameters": "kept" if continued else "learned",
+        "hyperparameters": "kept" if fitted.continued else "learned",
         "surveys_added": sorted(now - before),
         "surveys_removed": sorted(before - now),
         "tiles_fitted": fitted.tiles_refitted if fitted.state else None,
@@ -224,6 +223,7 @@ def _quality_bytes(fitted: FittedMap, changes: Result) -> bytes:
         "error_correlation_m": fitted.grid.error_correlation_m,
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
         "changes": changes,
+        "hard_iron": fitted.hard_iron,
         "out_of_date": [asdict(region) for region in fitted.out_of_date],
     }
     return json.dumps(quality, sort_keys=True, allow_nan=False).encode()

@@ -60,7 +60,7 @@ class EvaluationPlan:
     """
 
     window_lengths_m: tuple[float, ...] = (10.0, 20.0, 40.0)
-    spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0))
+    spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0, hard_iron=False))
     composition: Composition = "raw"
     session_bias: bool = True
     rehearse: bool = False

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from app import __version__
 from app.errors import CorruptArtefact
+from app.field.body_bias import BodyBias
+from app.field.hard_iron import HardIron
 from app.field.hilbert import Patch
 from app.field.hyperparameters import Hyperparameters
+from app.field.session_bias import SessionBias
 from app.field.tile_fit import FitState, HeldOutPart, Learned, TileFit
 from app.field.tiles import Lattice, Slab, Tile
 from app.services.artefacts import pack, unpack
@@ -57,9 +60,11 @@ def state_to_bytes(state: FitState) -> bytes | None:
     signal_sd_uT = hyper.pop("signal_sd_uT")
     header = {
         "written_by": _VERSION,
-        "hyper": hyper | {"noise_scale": dict(learned.hyper.noise_scale)},
+        "hyper": hyper | {name: dict(hyper[name]) for name in ("noise_scale", "offset_ratio")},
+        "sessions": {name: _listed(bias) for name, bias in state.hard_iron.sessions.items()},
+        "alone": {name: _listed(bias) for name, bias in state.hard_iron.surveys.items()},
         "lattice": asdict(learned.lattice),
-        "observations": learned.observations,
+        "samples": learned.samples,
         "surveys": surveys,
         "tiles": tiles,
         "shapes": [single.shapes, double.shapes],
@@ -89,8 +94,16 @@ def state_from_bytes(data: bytes) -> FitState:
         parts = {surveys[index]: HeldOutPart(next(double), next(double)) for index in held_out}
         tiles[Tile(*place)] = TileFit(tuple(surveys[index] for index in crossing), patch, parts, borders)
     hyper = Hyperparameters(signal_sd_uT=arrays["signal_sd_uT"], **header["hyper"])
-    learned = Learned(hyper, _lattice(header["lattice"]), arrays["ambient_uT"], header["observations"])
-    return FitState(learned, arrays["heights_m"], tiles)
+    learned = Learned(hyper, _lattice(header["lattice"]), arrays["ambient_uT"], header["samples"])
+    hard_iron = HardIron(
+        {name: SessionBias(*map(np.array, bias)) for name, bias in header["sessions"].items()},
+        {name: BodyBias(*map(np.array, bias)) if bias else None for name, bias in header["alone"].items()},
+    )
+    return FitState(learned, arrays["heights_m"], hard_iron, tiles)
+
+
+def _listed(bias: SessionBias | BodyBias | None) -> list[list[Any]] | None:
+    return None if bias is None else [bias.bias_body_uT.tolist(), bias.covariance_uT2.tolist()]
 
 
 class _Flat:

@@ -3,6 +3,7 @@ import pytest
 
 from app.field.exact import estimate_by_exact
 from app.field.fit import fit_map
+from app.field.hard_iron import Cleaned, HardIron
 from app.field.hilbert import posterior
 from app.field.hyperparameters import Hyperparameters
 from app.field.leave_one_out import HeldOut, HeldOutPrediction, error_correlation_m, score
@@ -57,7 +58,9 @@ def test_leaving_out_by_subtraction_equals_a_refit_without_the_survey(room, kind
 def test_the_exact_engine_leaves_out_by_honest_refits(room):
     walks = observe(room.lanes(np.random.default_rng(1), surveys=3, lane_m=2.0), "norm")
     ambient = np.median(np.concatenate([w.field_uT for w in walks]), axis=0)
-    estimate = estimate_by_exact(walks, MapSpec(engine="exact", resolution_m=1.0), None, lambda f, m: None)
+    estimate = estimate_by_exact(
+        walks, Cleaned({}, HardIron(), {}), MapSpec(engine="exact", resolution_m=1.0), None, lambda f, m: None
+    )
     left_out = walks[0]
     error = left_out.field_uT - ambient - estimate.held_out_mean_uT[left_out.survey_id]
     in_sample = np.std(left_out.field_uT)
