@@ -106,7 +106,7 @@ def chosen(walk: Samples, kept: np.ndarray) -> Samples:
 def errors_of(walk: Samples, mapped: np.ndarray, asked: np.ndarray, noise: str) -> Errors:
     """Without attitude, so that `fit_map` cannot take out a bias by itself."""
     plain = replace(walk, q_body_to_building=None)
-    fitted = fit_map({"first": chosen(plain, mapped)}, MapSpec(noise=noise))
+    fitted = fit_map({"first": chosen(plain, mapped)}, MapSpec(noise=noise, hard_iron=False))
     values = fitted.grid.at(walk.p_building_m[asked])
     sd_uT = np.sqrt(np.square(values.sd_uT) + np.square(fitted.grid.noise_sd_uT))
     return Errors(walk.B_uT[asked] - values.mean_uT, sd_uT)

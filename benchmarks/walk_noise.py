@@ -68,7 +68,7 @@ def main() -> int:
         building = make_building(rng, floors=1)
         walks, unseen = walk_floor(building, rng, SURVEYS), walk_floor(building, rng, UNSEEN)
         for noise, found in judged.items():
-            found.append(judge(fit_map(walks, MapSpec(noise=noise)), building, unseen))
+            found.append(judge(fit_map(walks, MapSpec(noise=noise, hard_iron=False)), building, unseen))
         white, walk = (np.sqrt(found[-1][0]) for found in judged.values())
         print(f"building {seed}: vector RMSE {white:.3f} uT with white noise, {walk:.3f} with walk noise")
     means = {noise: np.mean(found, axis=0) for noise, found in judged.items()}
