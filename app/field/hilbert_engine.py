@@ -11,6 +11,7 @@ import numpy as np
 
 from app.field.estimate import FieldEstimate, ambient_field_uT
 from app.field.hard_iron import Cleaned
+from app.field.held_out_choice import choose_by_held_out_surveys
 from app.field.learning import learn
 from app.field.leave_one_out import HeldOutPrediction
 from app.field.observations import Walk
@@ -39,7 +40,8 @@ def estimate_by_hilbert(
     else:
         previous = None
         ambient_uT = ambient_field_uT(walks)
-        learned = learn(walks, ambient_uT, spec, slab_m, lambda f, message: progress(0.4 * f, message))
+        learned = learn(walks, ambient_uT, spec, slab_m, lambda f, message: progress(0.3 * f, message))
+        learned = choose_by_held_out_surveys(walks, learned, spec, lambda f, text: progress(0.3 + 0.1 * f, text))
     learned = _with_offsets(learned, cleaned.offset_variance_uT2)
     old = previous.tiles if previous is not None and np.array_equal(previous.heights_m, layers_m) else {}
     lattice, hyper = learned.lattice, learned.hyper
