@@ -26,8 +26,8 @@ from app.geometry import Array
 __all__ = ["choose_by_held_out_surveys", "held_out_nlpd"]
 
 FEWEST_SURVEYS = 5
-LARGE_ERROR = 0.05
-"""Share of the signal's variance: below it errors are too small for a choice to matter."""
+LARGE_ERROR, LARGE_ERROR_UT = 0.05, 0.5
+"""Share of the signal's variance, and sd: below either, errors are too small for a choice to matter."""
 LENGTHS_M = (5.0, 8.0)
 ERROR_SHARES = (0.15, 0.3, 0.6)
 """Variance of the errors along a walk (or of white ones, where those are asked for), over the signal's."""
@@ -45,7 +45,9 @@ def choose_by_held_out_surveys(walks: Sequence[Walk], learned: Learned, spec: Ma
     """What was learned, or hyper-parameters that predict left-out surveys better. For flat maps of one kernel."""
     hyper = learned.hyper
     flat = learned.lattice.slab is None and hyper.short_length_m is None
-    if not flat or len(walks) < FEWEST_SURVEYS or hyper.bias_ratio + hyper.walk_ratio + hyper.white_ratio < LARGE_ERROR:
+    share = hyper.bias_ratio + hyper.walk_ratio + hyper.white_ratio
+    large = share > LARGE_ERROR and np.mean(hyper.error_sd_uT) > LARGE_ERROR_UT
+    if not flat or not large or len(walks) < FEWEST_SURVEYS:
         return learned
     part = _thinned(walks)
     best, least = learned, held_out_nlpd(part, learned, spec) - WORTH_NATS
