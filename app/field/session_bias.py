@@ -27,8 +27,7 @@ from app.field.samples import Components, Samples
 from app.geometry import Array, rotate_by_quaternion
 
 __all__ = [
-    "SessionBias", "SessionCalibration", "calibrate_sessions", "estimate_session_biases", "offset_variance_uT2",
-    "remove_session_biases", "unmet_session",
+    "SessionBias", "estimate_session_biases", "offset_variance_uT2", "remove_session_biases", "unmet_session",
 ]  # fmt: skip
 
 STRETCH_M = 0.6
@@ -59,31 +58,6 @@ class SessionBias:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SessionCalibration:
-    """walks: without the offsets of their sessions; biases: by session.
-
-    offset_variance_uT2: survey id -> (c,) variance of what is left of the offset in the features of its samples, a
-    constant of the survey; surveys without session or attitude are not in it.
-    """
-
-    walks: dict[str, Samples]
-    offset_variance_uT2: dict[str, Array]
-    biases: dict[str, SessionBias]
-
-    def as_json(self) -> list[dict[str, object]]:
-        """Plain JSON, one entry per session: its label, surveys, offset in the body frame and sds."""
-        return [
-            {
-                "session": session,
-                "surveys": [name for name, samples in self.walks.items() if samples.session == session],
-                "bias_body_ut": bias.bias_body_uT.tolist(),
-                "sd_ut": bias.sd_uT.tolist(),
-            }
-            for session, bias in self.biases.items()
-        ]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Stretches:
     """Means over short stretches of all walks: place (n, 2), field (n, 3), body to building (n, 3, 3), labels (n,)."""
 
@@ -93,21 +67,6 @@ class _Stretches:
     path_m: Array
     walk: NDArray[np.int64]
     session: NDArray[np.int64]
-
-
-def calibrate_sessions(walks: Mapping[str, Samples], components: Components) -> SessionCalibration:
-    """Walks of one floor without the offsets of their sessions, and what is not known of them, for a map.
-
-    Walks without session or attitude are left as they are.
-    """
-    biases = estimate_session_biases(walks)
-    cleaned = remove_session_biases(walks, biases)
-    left = {
-        name: offset_variance_uT2(samples, biases[str(samples.session)], components).mean(axis=0)
-        for name, samples in cleaned.items()
-        if samples.session in biases and _usable(samples)
-    }
-    return SessionCalibration(cleaned, left, biases)
 
 
 def unmet_session(samples: Samples) -> SessionBias:

@@ -60,7 +60,7 @@ class EvaluationPlan:
     """
 
     window_lengths_m: tuple[float, ...] = (10.0, 20.0, 40.0)
-    spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0, hard_iron=False))
+    spec: MapSpec = field(default_factory=lambda: MapSpec(resolution_m=1.0))
     composition: Composition = "raw"
     session_bias: bool = True
     rehearse: bool = False
@@ -136,14 +136,16 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
     floors, unreadable = _read_floors(directory, told)
     if plan.rehearse:
         floors = {floor_id: {name: walks[name] for name in hold_out(walks)[0]} for floor_id, walks in floors.items()}
+    spec = replace(plan.spec, hard_iron=plan.session_bias)
+    mapping = {floor_id: _mapping_samples(walks) for floor_id, walks in floors.items()}
     biases: dict[str, dict[str, SessionBias] | None] = dict.fromkeys(floors)
     if plan.session_bias:
-        biases = {floor_id: _mapping_biases(walks) for floor_id, walks in floors.items()}
+        biases = {floor_id: estimate_session_biases(samples) for floor_id, samples in mapping.items()}
         floors = {floor_id: calibrate_sessions(walks, biases[floor_id] or {}) for floor_id, walks in floors.items()}
     with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=_one_thread) as pool:
         fits = {
-            pool.submit(_fit_floor, _mapping_samples(walks), replace(plan.spec, noise=noise)): (floor_id, noise)
-            for floor_id, walks in floors.items()
+            pool.submit(_fit_floor, samples, replace(spec, noise=noise)): (floor_id, noise)
+            for floor_id, samples in mapping.items()
             for noise in NOISES
         }
         by_noise = dict(_collected(fits, told, "fitting maps"))
@@ -340,14 +342,9 @@ def _judge(
     )
 
 
-def _mapping_biases(walks: Mapping[str, Walk]) -> dict[str, SessionBias]:
-    """The offsets of the calibration sessions, as the walks to map show them."""
-    return estimate_session_biases({name: walks[name].samples for name in hold_out(walks)[0]})
-
-
 def _mapping_samples(walks: Mapping[str, Walk]) -> dict[str, Samples]:
-    """The walks to map. Their sessions' offsets are out already, or shall stay in: the fit is not told of them."""
-    return {name: replace(walks[name].samples, session=None) for name in hold_out(walks)[0]}
+    """The walks to map."""
+    return {name: walks[name].samples for name in hold_out(walks)[0]}
 
 
 def _mapped_places(walks: Mapping[str, Walk]) -> Array:

@@ -5,6 +5,7 @@ import pytest
 
 from app.field.estimate import ambient_field_uT
 from app.field.fit import fit_map
+from app.field.hard_iron import HardIron
 from app.field.held_out_choice import MOST_OBSERVATIONS, choose_by_held_out_surveys, held_out_nlpd
 from app.field.learning import learn
 from app.field.observations import Walk, observe
@@ -55,7 +56,7 @@ def test_choice_predicts_left_out_surveys_and_new_walks_better_where_labels_err(
     heights_m = np.array([1.2])
     nlpd = []
     for each in (chosen, learned):
-        grid = fit_map(walks, SPEC, previous=FitState(each, heights_m, {})).grid
+        grid = fit_map(walks, SPEC, previous=FitState(each, heights_m, HardIron(), {})).grid
         found = [grid.at(walk.p_building_m) for walk in fresh.values()]
         near = np.concatenate([values.measured for values in found])
         error = np.concatenate([w.B_uT - v.mean_uT for w, v in zip(fresh.values(), found, strict=True)])[near]
@@ -73,7 +74,7 @@ def test_score_is_that_of_the_map_itself(vague):
     """One sample per observation: the leave-one-out score of the fitted map is the same figure, another way."""
     observed, learned = vague
     fitted = fit_map(
-        straight_walks(np.random.default_rng(0), 1.5), SPEC, previous=FitState(learned, np.array([1.2]), {})
+        straight_walks(np.random.default_rng(0), 1.5), SPEC, previous=FitState(learned, np.array([1.2]), HardIron(), {})
     )
     assert held_out_nlpd(observed, learned, SPEC) == pytest.approx(fitted.score.nlpd, rel=0.02)
 

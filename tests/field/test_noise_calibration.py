@@ -12,7 +12,7 @@ def needed(rng, noise_sd, surveys=4, n=3000, latent=0.25):
 
 
 def test_noise_is_what_held_out_errors_show_whatever_was_believed():
-    shown = noise_sd_shown(list(needed(np.random.default_rng(0), 1.0).values()), BELIEVED)
+    shown = noise_sd_shown(list(needed(np.random.default_rng(0), 1.0, surveys=40, n=300).values()), BELIEVED)
     assert shown == pytest.approx([1.0, 1.0], rel=0.05)
 
 
@@ -23,7 +23,7 @@ def test_few_surveys_leave_the_belief_alone():
 
 
 def test_a_survey_is_not_scored_with_its_own_errors():
-    all_needed = needed(np.random.default_rng(0), 1.0)
+    all_needed = needed(np.random.default_rng(0), 1.0, surveys=40, n=300)
     all_needed["0"] = all_needed["0"] + 100.0
     assert noise_sd_by_survey(all_needed, BELIEVED)["0"] == pytest.approx([1.0, 1.0], rel=0.05)
 
@@ -43,3 +43,16 @@ def test_the_noise_for_a_survey_is_what_the_others_show_alone():
     for survey_id, sd in by_survey.items():
         alone = noise_sd_shown([n for other, n in needed.items() if other != survey_id], believed)
         assert np.allclose(sd, alone, rtol=1e-12), survey_id
+
+
+def test_new_surveys_are_covered_as_stated_when_each_has_its_own_scale():
+    """Few surveys, whose errors are common to much of them: what is set on them covers the next ones."""
+    rng = np.random.default_rng(1)
+    covered = []
+    for _ in range(150):
+        scale = np.exp(0.5 * rng.standard_normal(13))
+        errors = scale[:, None, None] * (rng.standard_normal((13, 12, 1)) + 0.5 * rng.standard_normal((13, 12, 40)))
+        seen = [np.square(e.reshape(-1, 1)) / 4.0 for e in errors[:12]]
+        sd = noise_sd_shown(seen, np.array([1e-3]))
+        covered.append(np.mean(np.abs(errors[12]) <= 2.0 * sd))
+    assert np.mean(covered) == pytest.approx(0.9545, abs=0.015)
