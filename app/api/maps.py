@@ -46,7 +46,8 @@ class NewMap(RequestModel):
     engine: Literal["hilbert", "exact", "compromise"] = "hilbert"
     components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
     kernel: Annotated[
-        Kernel | None, Field(description="one, or a sum of two lengths; default matern32, for curl-free maps matern52")
+        Kernel | None,
+        Field(description="one, or a sum of two lengths; default matern32, curl-free squared_exponential"),
     ] = None
     curl_free: Annotated[
         bool, Field(description="the field as the gradient of a potential: vector maps, engine hilbert")

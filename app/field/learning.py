@@ -28,13 +28,17 @@ LEARNING_TILES = (6, 10)
 TILES_PER_LEARNING_TILE = 12
 LEARNING_FUNCTIONS = 15
 ROUNDS = 6
-LEARNING_SLABS = (3, 4)
+LEARNING_SLABS = (4, 6)
 LEARNABLE = (8.0, 1.0)
 """A tile can tell lengths between an eighth of its pitch (its functions are no finer) and all of it (its size)."""
 LEARNABLE_IN_SLAB = 4.0
-GOOD_ENOUGH_SLAB = 1.3
+LONGEST_IN_SLAB = 0.3
+GOOD_ENOUGH_SLAB = 2.6
 CRAMPED = 1.05
 """A length this near to the least a lattice can tell would be shorter if it could."""
+SHORTER_POTENTIAL = 0.75
+"""Boxes small enough for a likelihood lack the long waves of a potential, and their lengths come out too long: maps of
+analytic buildings are best at about this share of them, and a fifth worse at the whole."""
 START_IN_SLAB_M = 1.0
 """Boxes have few functions to spare: too coarse ones make a rough field look smooth, too fine ones only cost."""
 LARGE_OFFSET = 0.01
@@ -78,7 +82,8 @@ class _Learner:
         self._kernel = kernel
         self._pin_bias = len(walks) == 1
         finest = LEARNABLE[0] if lattice.slab is None else LEARNABLE_IN_SLAB
-        self._length_bounds_m = (lattice.pitch_m / finest, lattice.pitch_m / LEARNABLE[1])
+        longest = LEARNABLE[1] if lattice.slab is None else LONGEST_IN_SLAB
+        self._length_bounds_m = (lattice.pitch_m / finest, lattice.pitch_m / longest)
         self._tiled = TiledWalks(lattice, walks, ambient_uT)
         self._chosen = _well_walked(self._tiled.counts(), LEARNING_TILES if lattice.slab is None else LEARNING_SLABS)
 
@@ -123,6 +128,13 @@ def learn(
     if spec.noise == "walk":
         found = _learn_walk_noise(learner, found, progress)
     hyper = found.hyper
+    if spec.curl_free:
+        short = hyper.short_length_m
+        hyper = replace(
+            hyper,
+            length_m=SHORTER_POTENTIAL * hyper.length_m,
+            short_length_m=None if short is None else SHORTER_POTENTIAL * short,
+        )
     if slab_m is not None:
         lattice = Lattice.of_slabs(kernel, hyper.finest_length_m, slab_m, spec.curl_free)
     else:

@@ -51,7 +51,7 @@ Progress = Callable[[float, str], None]  # (fraction 0..1, message); may raise J
 class MapSpec:
     """The parameters of a map.
 
-    kernel      None: matern32, or for a curl-free map matern52
+    kernel      None: matern32, or for a curl-free map squared_exponential
     heights_m   heights of the layers, rising; None: one layer at the samples' median height
     curl_free   the field is the gradient of a potential, and free of sources where somebody walked (vector maps)
     noise       "walk": errors along a walk may be correlated, as far as the likelihood says; "white": never
@@ -72,7 +72,7 @@ class MapSpec:
     @property
     def covariance(self) -> Kernel:
         """The kernel to use."""
-        return self.kernel or ("matern52" if self.curl_free else "matern32")
+        return self.kernel or ("squared_exponential" if self.curl_free else "matern32")
 
 
 @dataclass(frozen=True, slots=True)
