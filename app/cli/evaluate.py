@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["evaluate"]
 
-_FILE_WIDTH = 130
+_FILE_WIDTH = 170
 
 
 def evaluate(
