@@ -32,7 +32,7 @@ LARGE_ERROR, LARGE_ERROR_UT = 0.05, 0.5
 LENGTHS_M = (5.0, 8.0)
 ERROR_SHARES = (0.15, 0.3)
 """Variance of the errors along a walk (or of white ones, where those are asked for), over the signal's. Longer lengths
-and larger errors predicted left-out walks of a mall a little better still; but smooth maps are said to locate less well."""
+and larger errors predicted left-out walks of a mall a little better; but smooth maps are said to locate less well."""
 WALK_LENGTH_M = 3.0
 WHITE_SHARE, OFFSET_SHARE = 0.02, 0.15
 WORTH_NATS = 0.01
