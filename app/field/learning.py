@@ -1,20 +1,20 @@
 """Learning the hyper-parameters of a map on a few of its tiles.
 
 First kernel length, white noise and survey offsets, on the lattice that suits the length they find; then the shape of
-the errors along a walk, by a compass search over its two parameters: each trial whitens the walks anew and learns the
-rest from the statistics, starting where the best trial so far ended.
+the errors along a walk, one after the other of its two parameters: each trial whitens the walks anew and learns the
+rest from the statistics, starting where the nearest trial ended, with the curvature found there.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
-from app.field.hyperparameters import Hyperparameters
-from app.field.marginal_likelihood import START_LOG, TOLERANCE, TileStatistics
+from app.field.kernels import base_kernel
+from app.field.marginal_likelihood import START_LOG, TOLERANCE, MostLikely, TileStatistics
 from app.field.marginal_likelihood import learn as most_likely
 from app.field.observations import Walk
-from app.field.spec import Kernel, MapSpec, Progress
+from app.field.spec import BaseKernel, Kernel, MapSpec, Progress
 from app.field.tile_fit import Learned
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
@@ -26,7 +26,9 @@ __all__ = ["learn"]
 LEARNING_TILES = (6, 10)
 """At least and at most; in between, one in `TILES_PER_LEARNING_TILE` of the tiles walked."""
 TILES_PER_LEARNING_TILE = 12
-LEARNING_FUNCTIONS = 15
+LEARNING_FUNCTIONS: dict[BaseKernel, int] = {"squared_exponential": 15, "matern52": 14, "matern32": 14}
+WIDER_TO_LEARN = 1.1
+"""Than a tile is fitted: the wider, the better offsets and long errors are told from the field."""
 ROUNDS = 6
 LEARNING_SLABS = (4, 6)
 LEARNABLE = (8.0, 1.0)
@@ -52,28 +54,19 @@ ROUGH_TOLERANCE = 1e-3
 """What is still less likely than white noise when an iteration gains less than this is not followed further."""
 WORTH_NATS = 0.02
 """Errors are taken to be correlated along a walk when that gains this log likelihood per observation and component."""
-MAX_TRIALS = 20
+MAX_TRIALS = 10
+"""Along one of them."""
 WALK_NOISE_BOUNDS_LOG = np.log([(1e-2, 0.5), (1e4, 25.0)])
 """Of the variance ratio and the length in metres: what varies faster or slower is white noise, or an offset."""
-COMPASS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
-SMALLEST_STEP = np.log(1.5)
+STEPS_LOG = (float(np.log(4.0)), float(np.log(2.0)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """Where one search for length, white noise and offsets ended."""
-
-    hyper: Hyperparameters
-    log_parameters: Array
-    nats: float
-    """Negative log marginal likelihood per observation and component."""
-
-    def start_with(self, noise: WalkNoise) -> Array:
-        """The parameters to start from with another shape of noise: white and correlated error keep their sum."""
-        own = self.hyper.walk_ratio / self.hyper.white_ratio
-        start = self.log_parameters.copy()
-        start[1] += np.log1p(own) - np.log1p(noise.variance_ratio)
-        return start
+def _start_with(found: MostLikely, noise: WalkNoise) -> Array:
+    """The parameters to start from with another shape of noise: white and correlated error keep their sum."""
+    own = found.hyper.walk_ratio / found.hyper.white_ratio
+    start = found.log_parameters.copy()
+    start[1] += np.log1p(own) - np.log1p(noise.variance_ratio)
+    return start
 
 
 class _Learner:
@@ -88,16 +81,16 @@ class _Learner:
         self._tiled = TiledWalks(lattice, walks, ambient_uT)
         self._chosen = _well_walked(self._tiled.counts(), LEARNING_TILES if lattice.slab is None else LEARNING_SLABS)
 
-    def learn(self, noise: WalkNoise, start_log: Array, tolerance: float = TOLERANCE) -> _Found:
+    def learn(
+        self, noise: WalkNoise, start_log: Array, curvature: Array | None = None, tolerance: float = TOLERANCE
+    ) -> MostLikely:
         tiles = [
             TileStatistics.of(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise).values())
             for tile in self._chosen
         ]
-        hyper, log_parameters, value = most_likely(
-            tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias, tolerance
+        return most_likely(
+            tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias, tolerance, curvature
         )
-        count = sum(tile.count for tile in tiles)
-        return _Found(hyper, log_parameters, value / (count * len(hyper.signal_sd_uT)))
 
 
 def learn(
@@ -109,7 +102,8 @@ def learn(
     def learning_lattice(length_m: float) -> Lattice:
         if slab_m is not None:
             return Lattice.of_slabs(kernel, length_m, slab_m, spec.curl_free)
-        return replace(Lattice.for_length(kernel, length_m, wide=True), functions_per_axis=LEARNING_FUNCTIONS)
+        suited = Lattice.for_length(kernel, WIDER_TO_LEARN * length_m, wide=True)
+        return replace(suited, functions_per_axis=LEARNING_FUNCTIONS[base_kernel(kernel)])
 
     start_log = START_LOG.copy()
     if slab_m is not None:
@@ -144,31 +138,47 @@ def learn(
     return Learned(hyper, lattice, ambient_uT, sum(len(walk.sample_field_uT) for walk in walks))
 
 
-def _learn_walk_noise(learner: _Learner, white: _Found, progress: Progress) -> _Found:
-    """The best of white noise and correlated noise of any strength and length. Compass search over their logs."""
-    rough = [learner.learn(noise, white.start_with(noise), ROUGH_TOLERANCE) for noise in TRIED_FIRST]
+def _learn_walk_noise(learner: _Learner, white: MostLikely, progress: Progress) -> MostLikely:
+    """The best of white noise and correlated noise of any strength and length."""
+    rough = [learner.learn(noise, _start_with(white, noise), white.curvature, ROUGH_TOLERANCE) for noise in TRIED_FIRST]
     tried, noise = min(zip(rough, TRIED_FIRST, strict=True), key=lambda pair: pair[0].nats)
     if tried.nats > white.nats:
         return white
-    best = learner.learn(noise, tried.log_parameters)
+    best = learner.learn(noise, tried.log_parameters, tried.curvature)
     if best.nats > white.nats - WORTH_NATS:
         return white
-    centre, step = np.log(astuple(noise)), np.log([4.0, 2.0])
-    direction, failures = 0, 0
-    for trial in range(MAX_TRIALS):
-        progress(0.5 + 0.5 * trial / MAX_TRIALS, "learning the errors along a walk")
-        point = np.clip(centre + step * COMPASS[direction], *WALK_NOISE_BOUNDS_LOG)
-        noise = WalkNoise(*np.exp(point).tolist())
-        found = learner.learn(noise, best.start_with(noise))
-        if found.nats < best.nats:
-            best, centre, failures = found, point, 0
-            continue
-        direction, failures = (direction + 1) % len(COMPASS), failures + 1
-        if failures == len(COMPASS):
-            step, failures = step / 2.0, 0
-            if step[0] < SMALLEST_STEP:
-                break
+    point = np.log(astuple(noise))
+    for axis, step in enumerate(STEPS_LOG):
+        point, best = _best_along(learner, axis, step, point, best, progress)
     return best
+
+
+def _best_along(
+    learner: _Learner, axis: int, step: float, point: Array, best: MostLikely, progress: Progress
+) -> tuple[Array, MostLikely]:
+    """Steps of log variance ratio (axis 0) or log length until the best is between two worse, then the parabola."""
+    direction = np.eye(2)[axis]
+    least, most = np.ceil((WALK_NOISE_BOUNDS_LOG[:, axis] - point[axis]) / step)
+    tried = {0.0: best}
+
+    def try_at(steps: float) -> None:
+        progress(0.5 + 0.25 * (axis + len(tried) / MAX_TRIALS), "learning the errors along a walk")
+        noise = WalkNoise(*np.exp(point + steps * step * direction).tolist())
+        nearest = tried[min(tried, key=lambda known: abs(known - steps))]
+        tried[steps] = learner.learn(noise, _start_with(nearest, noise), nearest.curvature)
+
+    while len(tried) < MAX_TRIALS - 1:
+        middle = min(tried, key=lambda steps: tried[steps].nats)
+        missing = [steps for steps in (middle + 1.0, middle - 1.0) if steps not in tried and least < steps < most]
+        if not missing:
+            break
+        try_at(missing[0])
+    if middle - 1.0 in tried and middle + 1.0 in tried:
+        before, at, after = (tried[middle + steps].nats for steps in (-1.0, 0.0, 1.0))
+        if before + after > 2.0 * at:
+            try_at(middle + 0.5 * (before - after) / (before - 2.0 * at + after))
+    best_steps = min(tried, key=lambda steps: tried[steps].nats)
+    return point + best_steps * step * direction, tried[best_steps]
 
 
 def _well_walked(counts: Mapping[Tile, int], least_and_most: tuple[int, int]) -> list[Tile]:

@@ -9,13 +9,14 @@ Rasmussen & Williams 2006, 5.4.1; statistics as Solin & Sarkka 2020, 3.3.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
-from scipy.optimize import minimize
 from scipy.special import expit
 
+from app.field.descent import descend
 from app.field.hyperparameters import Basis, Hyperparameters, weight_variance
 from app.field.kernels import is_sum, log_spectral_slope
 from app.field.spec import Kernel
@@ -23,7 +24,7 @@ from app.field.statistics import Gram, SurveyStatistics
 from app.field.walk_noise import WalkNoise
 from app.geometry import Array
 
-__all__ = ["Likelihood", "TileStatistics", "learn", "negative_log_likelihood"]
+__all__ = ["Likelihood", "MostLikely", "TileStatistics", "learn", "negative_log_likelihood"]
 
 SCALE_FLOOR_UT2 = 1e-6
 LENGTH_BOUNDS_M = (0.3, 40.0)
@@ -31,10 +32,11 @@ RATIO_BOUNDS_LOG = np.log([(1e-6, 1e2), (1e-8, 1e1)])
 SECOND_BOUNDS = np.array([(np.log(0.15), np.log(0.7)), (-4.0, 2.0)])
 """Of a sum: log of the second length over the first, and logit of its share of the variance."""
 START_SECOND = np.array([np.log(0.35), -1.5])
-MAX_ITERATIONS = 40
-TOLERANCE = 3e-5
-"""Relative gain of an iteration below which the search ends; the objective is the value per observation, about one."""
+TOLERANCE = 2e-5
+"""The search ends when a step gains less log likelihood than this per observation and component."""
 START_LOG = np.log([3.0, 1e-2, 1e-4])
+START_CURVATURE = np.array([0.1, 0.1, 0.01, 0.1, 0.01])
+"""Of the value per observation and component along each parameter, on the low side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +82,32 @@ class Likelihood:
     signal_variance_uT2: Array
 
 
+class MostLikely(NamedTuple):
+    """Hyper-parameters; their logarithms (p,) and the curvature (p, p) there, to start from next time; and the value,
+
+    negative log marginal likelihood per observation and component.
+    """
+
+    hyper: Hyperparameters
+    log_parameters: Array
+    curvature: Array
+    nats: float
+
+
+class _Prior(NamedTuple):
+    """sd (m,) of the weights over the signal's; derivatives (k, m) of their log variance with the kernel's parameters:
+
+    k is 1, or 3 of a sum.
+    """
+
+    sd: Array
+    log_slopes: Array
+
+    @classmethod
+    def of(cls, hyper: Hyperparameters, basis: Basis) -> "_Prior":
+        return cls(hyper.prior_sd(basis), _log_slopes(hyper, basis))
+
+
 @dataclass(slots=True)
 class _Terms:
     """Of one tile or a sum of tiles: energy (c,) `y^T C^-1 y`, log_det of C, and their derivatives (p, c) and (p,)."""
@@ -94,7 +122,8 @@ class _Terms:
 def negative_log_likelihood(tiles: Sequence[TileStatistics], kernel: Kernel, log_parameters: Array) -> Likelihood:
     """Concentrated over the signal variances, summed over tiles and components."""
     hyper = _hyperparameters(kernel, log_parameters)
-    terms = [_tile_terms(tile, hyper) for tile in tiles]
+    priors = {basis: _Prior.of(hyper, basis) for basis in {tile.basis.at_origin() for tile in tiles}}
+    terms = [_tile_terms(tile, hyper, priors[tile.basis.at_origin()]) for tile in tiles]
     n = sum(term.count for term in terms)
     energy = np.sum([term.energy for term in terms], axis=0) + n * SCALE_FLOOR_UT2
     components = len(energy)
@@ -114,11 +143,12 @@ def learn(
     length_bounds_m: tuple[float, float] = LENGTH_BOUNDS_M,
     pin_bias: bool = False,
     tolerance: float = TOLERANCE,
-) -> tuple[Hyperparameters, Array, float]:
-    """The most likely hyper-parameters, their logarithms (to start from next time), and the value reached.
+    curvature: Array | None = None,
+) -> MostLikely:
+    """The most likely hyper-parameters, to within a gain of `tolerance` per observation and component.
 
-    The search ends when an iteration gains less than `tolerance` of the value. `pin_bias` keeps the offset at its
-    lower bound: a single survey's offset is the ambient field's.
+    `pin_bias` keeps the offset at its lower bound: a single survey's offset is the ambient field's. `start_log` and
+    `curvature` are best those of a similar search.
     """
     bounds = np.vstack([np.log(length_bounds_m), RATIO_BOUNDS_LOG])
     if is_sum(kernel):
@@ -133,20 +163,15 @@ def learn(
         return likelihood.value / count, likelihood.gradient / count
 
     seen: dict[bytes, Likelihood] = {}
-    count = sum(tile.count for tile in tiles)
-    start = np.clip(start_log, bounds[:, 0], bounds[:, 1])
-    best = minimize(
-        objective,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=list(map(tuple, bounds.tolist())),
-        options={"maxiter": MAX_ITERATIONS, "ftol": tolerance},
-    )
-    likelihood = seen[best.x.tobytes()]
-    hyper = replace(_hyperparameters(kernel, best.x), signal_sd_uT=np.sqrt(likelihood.signal_variance_uT2))
+    count = sum(tile.count * len(tile.energy) for tile in tiles)
+    if curvature is None:
+        curvature = np.diag(START_CURVATURE[: len(bounds)])
+    best = descend(objective, start_log, bounds, curvature, tolerance)
+    likelihood = seen[best.point.tobytes()]
+    hyper = replace(_hyperparameters(kernel, best.point), signal_sd_uT=np.sqrt(likelihood.signal_variance_uT2))
     walk_ratio = walk_noise.variance_ratio * hyper.white_ratio
-    return replace(hyper, walk_ratio=walk_ratio, walk_length_m=walk_noise.length_m), best.x, likelihood.value
+    hyper = replace(hyper, walk_ratio=walk_ratio, walk_length_m=walk_noise.length_m)
+    return MostLikely(hyper, best.point, best.curvature, best.value)
 
 
 def _hyperparameters(kernel: Kernel, log_parameters: Array) -> Hyperparameters:
@@ -160,7 +185,7 @@ def _hyperparameters(kernel: Kernel, log_parameters: Array) -> Hyperparameters:
 
 
 def _log_slopes(hyper: Hyperparameters, basis: Basis) -> Array:
-    """(1, m) or (3, m) derivatives of the log prior variance of the weights with the parameters of the kernel."""
+    """(1, m), or (3, m) of a sum."""
     by_term = weight_variance(hyper.terms, basis)
     share = by_term / by_term.sum(axis=0)
     slopes = np.stack(
@@ -175,10 +200,10 @@ def _log_slopes(hyper: Hyperparameters, basis: Basis) -> Array:
     return np.stack([both, share[1] * slopes[1], share[1] - hyper.short_share])
 
 
-def _tile_terms(tile: TileStatistics, hyper: Hyperparameters) -> _Terms:
+def _tile_terms(tile: TileStatistics, hyper: Hyperparameters, prior: _Prior) -> _Terms:
     """Energy and log determinant of one tile, with S^(1/2)-scaled weights so that every matrix is I plus something."""
     white, bias = hyper.white_ratio, hyper.bias_ratio
-    root = hyper.prior_sd(tile.basis)
+    root = prior.sd
     shrink = bias / (white + bias * tile.ones)
     offsets = root[:, None] * tile.offsets
     weighted = shrink[:, None] * tile.ones_target
@@ -199,7 +224,7 @@ def _tile_terms(tile: TileStatistics, hyper: Hyperparameters) -> _Terms:
     own = bias * tile.ones / (white + bias * tile.ones)
     log_det = 2.0 * np.sum(np.log(np.diagonal(factor))) + tile.count * np.log(white) - np.sum(np.log1p(-own))
 
-    slope, *second = _log_slopes(hyper, tile.basis)
+    slope, *second = prior.log_slopes
     shrink_slope = shrink * white / (white + bias * tile.ones)
     energy_by_shrink = -np.square(tile.ones_target - offsets.T @ z) / white
     log_det_by_shrink = -np.sum(np.square(inverse @ offsets), axis=0) / white

@@ -14,6 +14,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 
@@ -41,7 +42,7 @@ class Gram:
         if self.of_moments:
             assert isinstance(basis, CosineBasis)
             return gram_of_moments(basis, self.table, scale)
-        return np.asfortranarray(self.table * np.outer(scale, scale))
+        return np.asarray(_scaled_triangle(self.table, scale).T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +158,17 @@ def _sources(basis: Basis, points_m: Array) -> Array | None:
     air_m = points_m.copy()
     air_m[:, 2] = np.resize(np.linspace(low_m, high_m, levels), len(points_m))
     return np.asarray(dsyrk(1.0, basis.divergence_rows(air_m).T, lower=1))
+
+
+@njit(cache=True)
+def _scaled_triangle(table: Array, scale: Array) -> Array:
+    """`table[j, i] scale[i] scale[j]`, j >= i, as the upper triangle in C order; zero below."""
+    m = len(scale)
+    scaled = np.zeros((m, m))
+    for i in range(m):
+        for j in range(i, m):
+            scaled[i, j] = table[j, i] * (scale[i] * scale[j])
+    return scaled
 
 
 def add_evidence(evidence: Collection[Evidence]) -> Evidence:

@@ -26,7 +26,7 @@ PITCHES_M = (
     *(10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0, 22.4, 25.0, 28.0, 31.5, 40.0, 63.0, 100.0),
 )
 PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 2.0, "matern32": 1.1}
-WIDE_PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 3.0, "matern32": 2.25}
+WIDE_PITCH_IN_LENGTHS: dict[BaseKernel, float] = {"squared_exponential": 4.5, "matern52": 2.4, "matern32": 1.8}
 """A rough kernel has detail finer than its length and wants functions packed closer than a smooth one. Small tiles
 cost least; only wide ones can tell a long length, or a survey's offset in the tile, from a large field."""
 MARGIN = 0.3
@@ -34,7 +34,7 @@ POTENTIAL_MARGIN = 0.5
 """A potential adds up what lies around: with sparse lanes a narrow margin costs a quarter of the accuracy."""
 OVERLAP = 0.1
 FUNCTIONS_PER_AXIS: dict[BaseKernel, int] = {"squared_exponential": 15, "matern52": 14, "matern32": 15}
-WIDE_FUNCTIONS_PER_AXIS: dict[BaseKernel, int] = {"squared_exponential": 15, "matern52": 20, "matern32": 23}
+WIDE_FUNCTIONS_PER_AXIS: dict[BaseKernel, int] = {"squared_exponential": 15, "matern52": 16, "matern32": 18}
 
 BORDER_POINTS = 9
 

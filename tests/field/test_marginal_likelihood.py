@@ -94,13 +94,16 @@ def test_gradient_of_a_sum_equals_finite_differences_on_a_box_of_a_potential(bas
 def test_learning_never_ends_below_where_it_started():
     tiles = [tile(walks(WHITE, seed=3), WHITE)]
     start = np.log([3.0, 1e-2, 1e-3])
-    _, _, value = learn(tiles, "matern32", WHITE, start)
-    assert value < negative_log_likelihood(tiles, "matern32", start).value
+    found = learn(tiles, "matern32", WHITE, start)
+    observations = 2 * tiles[0].count
+    assert found.nats < negative_log_likelihood(tiles, "matern32", start).value / observations
+    at_the_end = negative_log_likelihood(tiles, "matern32", found.log_parameters).value
+    assert found.nats == pytest.approx(at_the_end / observations)
 
 
 def test_a_constant_field_is_learned_without_dividing_by_zero():
     points, _, path = walks(WHITE)[0]
     flat = TileStatistics.of(BASIS, [survey_statistics(BASIS, points, np.zeros((len(points), 1)), path, WHITE)])
-    hyper, _, value = learn([flat], "matern32", WHITE)
-    assert np.isfinite(value)
-    assert hyper.signal_sd_uT[0] < 0.1
+    found = learn([flat], "matern32", WHITE)
+    assert np.isfinite(found.nats)
+    assert found.hyper.signal_sd_uT[0] < 0.1
