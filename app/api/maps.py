@@ -59,6 +59,9 @@ class NewMap(RequestModel):
         bool, Field(description="take the sensors' own constant field out of surveys that know their orientation")
     ] = True
     robust: Annotated[bool, Field(description="heavy-tailed errors: stray readings count less")] = False
+    refine: Annotated[
+        bool, Field(description="correct the surveys' positions where that proves itself: engine hilbert")
+    ] = False
     resolution_m: Annotated[Finite, Field(ge=0.05, le=5.0)] = 0.25
     heights_m: Annotated[
         list[Metres], Field(min_length=1, max_length=100, description="one height; default: the samples' median")
@@ -150,6 +153,8 @@ def _check_together(body: NewMap) -> None:
         faults.append(Fault("/body/curl_free", "needs engine hilbert and components vector"))
     if body.robust and body.engine != "hilbert":
         faults.append(Fault("/body/robust", "needs engine hilbert"))
+    if body.refine and body.engine != "hilbert":
+        faults.append(Fault("/body/refine", "needs engine hilbert"))
     if body.kernel is not None and is_sum(body.kernel) and body.engine != "hilbert":
         faults.append(Fault("/body/kernel", f"a sum needs engine hilbert; ask for {base_kernel(body.kernel)}"))
     if body.heights_m is not None and any(b - a < 0.01 for a, b in pairwise(body.heights_m)):

@@ -1,6 +1,7 @@
 """Samples in, map out: the one entry of the map engine."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +20,7 @@ from app.field.leave_one_out import HeldOut, error_correlation_m, score
 from app.field.measured import measured_cells, near_other_walks
 from app.field.noise_calibration import noise_sd_by_survey, noise_sd_shown
 from app.field.observations import Walk, observe
+from app.field.refinement import Untouched, refine
 from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import Engine, FittedMap, MapSpec, Progress
 from app.field.tile_fit import FitState
@@ -36,6 +38,8 @@ _ENGINES: dict[Engine, _Estimator] = {
 
 RELEARN = 2.0
 """What was learned is learned anew when there are this many times more, or fewer, samples."""
+REFINING = 0.8
+"""Share of the progress that refinement takes."""
 
 
 def _silent(fraction: float, message: str) -> None:
@@ -51,34 +55,44 @@ def fit_map(
 
     `previous` is the state an earlier fit with the same parameters left (FittedMap.state): only tiles whose surveys
     have changed are fitted again, and the map is what a fit of everything with the same hyper-parameters gives. An id
-    must stand for the same samples in both.
+    must stand for the same samples in both. A map of refined walks is fitted from nothing, and leaves no state: a walk
+    more moves all the others.
     `progress(fraction, message)` is called often; what it raises (JobCancelled) passes through.
     Raises InvalidInput when there is too little to fit or the parameters make no map, IncompatibleFrames when a walk
     cannot give `spec.components`.
     """
     _check(spec)
     progress(0.0, "reading the walks")
-    if previous is not None and not _about_as_many(previous.learned.samples, sum(map(len, walks.values()))):
+    samples = sum(map(len, walks.values()))
+    if spec.refine or (previous is not None and not _about_as_many(previous.learned.samples, samples)):
         previous = None
     cleaned = Cleaned(walks, HardIron(), {})
     if spec.hard_iron:
         cleaned = remove_hard_iron(walks, spec.components, previous.hard_iron if previous else HardIron())
+    refining = REFINING if spec.refine else 0.0
+    refinement = refine(cleaned, spec, lambda f, text: progress(refining * f, text)) if spec.refine else None
+    applied = refinement if refinement is not None and refinement.worth_it else None
+    if applied is not None:
+        cleaned = replace(cleaned, walks=applied.walks)
     observed = observe(cleaned.walks, spec.components)
-    estimate = _ENGINES[spec.engine](observed, cleaned, spec, previous, lambda f, text: progress(0.9 * f, text))
+    estimate = _ENGINES[spec.engine](
+        observed, cleaned, spec, previous, lambda f, text: progress(refining + (0.9 - refining) * f, text)
+    )
     progress(0.9, "scoring the map by leaving each survey out")
-    held_out, noise_sd_uT = _held_out(observed, estimate)
+    held_out, noise_sd_uT = _held_out(observed, estimate, applied.untouched if applied else {})
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
     names, frame = COMPONENT_NAMES[spec.components], estimate.frame
+    about_labels = {"refinement": refinement.as_json()} if refinement else {}
     return FittedMap(
         grid=_grid(observed, estimate, spec, noise_sd_uT, correlation_m),
-        hyperparameters={"engine": spec.engine} | estimate.hyperparameters,
+        hyperparameters={"engine": spec.engine} | estimate.hyperparameters | about_labels,
         score=scored,
         score_reason=None if scored else _score_reason(observed),
         consistency=check_surveys(held_out, names, correlation_m),
         layers=quality_layers(frame.x_m, frame.y_m, frame.heights_m, observed, held_out),
         out_of_date=out_of_date_regions(observed, held_out, sorted(walks), names, correlation_m),
-        state=estimate.state,
+        state=None if spec.refine else estimate.state,
         tiles_refitted=estimate.tiles_refitted,
         continued=estimate.continued,
         hard_iron=cleaned.hard_iron.as_json(),
@@ -101,16 +115,26 @@ def _check(spec: MapSpec) -> None:
         raise InvalidInput(f"a {spec.components} map has no curl to be free of: ask for components vector")
     if spec.curl_free and spec.engine != "hilbert":
         raise InvalidInput(f"the {spec.engine} engine has independent components: curl_free needs engine hilbert")
+    if spec.refine and spec.engine != "hilbert":
+        raise InvalidInput(f"the {spec.engine} engine does not refine walks: refine needs engine hilbert")
 
 
-def _held_out(walks: Sequence[Walk], estimate: FieldEstimate) -> tuple[dict[str, HeldOut], Array]:
-    """Every survey against the map of the others, and the noise sd (c,) of one further measurement."""
+def _held_out(
+    walks: Sequence[Walk], estimate: FieldEstimate, untouched: Mapping[str, Untouched]
+) -> tuple[dict[str, HeldOut], Array]:
+    """Every survey against the map of the others, and the noise sd (c,) of one further measurement.
+
+    untouched: of surveys whose labels were corrected by the others, which agree too well.
+    """
     near = near_other_walks(walks, volume=len(estimate.gradient_uT_per_m) == 3)
     error_uT, latent_uT2, needed_uT2 = {}, {}, {}
     for walk in walks:
         name, stretch = walk.survey_id, walk.stretch_of_sample
         error_uT[name] = walk.sample_field_uT - (estimate.ambient_uT + estimate.held_out_mean_uT[name])[stretch]
         latent_uT2[name] = (estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT))[stretch]
+        if name in untouched:
+            error_uT[name] = walk.sample_field_uT - untouched[name].mean_uT
+            latent_uT2[name] = untouched[name].variance_uT2
         needed_uT2[name] = (np.square(error_uT[name]) / 4.0 - latent_uT2[name])[near[name]]
     scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
     believed_sd_uT = np.sqrt(np.square(estimate.error_sd_uT) + scatter_uT2)

@@ -57,6 +57,7 @@ class MapSpec:
     noise       "walk": errors along a walk may be correlated, as far as the likelihood says; "white": never
     hard_iron   take the sensors' own constant field out of walks that know their orientation
     robust      heavy-tailed (Student) errors: what disagrees with everything near it counts less
+    refine      correct the walks' labels where that proves itself (app.field.refinement); engine hilbert
     """
 
     components: Components = "vector"
@@ -68,6 +69,7 @@ class MapSpec:
     noise: Noise = "walk"
     hard_iron: bool = True
     robust: bool = False
+    refine: bool = False
 
     @property
     def covariance(self) -> Kernel:

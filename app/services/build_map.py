@@ -224,6 +224,7 @@ def _quality_bytes(fitted: FittedMap, changes: Result) -> bytes:
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
         "changes": changes,
         "hard_iron": fitted.hard_iron,
+        "refinement": fitted.hyperparameters.get("refinement"),
         "out_of_date": [asdict(region) for region in fitted.out_of_date],
     }
     return json.dumps(quality, sort_keys=True, allow_nan=False).encode()

@@ -255,6 +255,7 @@ def test_a_compromise_map_on_request_says_how_near_it_is(service: Any, mapped_fl
         {"heights_m": [2.0, 1.0]},
         {"kernel": "matern32+matern32", "engine": "exact"},
         {"robust": True, "engine": "exact"},
+        {"refine": True, "engine": "exact"},
     ],
 )
 def test_parameters_that_do_not_go_together_are_refused(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
@@ -268,6 +269,7 @@ def test_parameters_that_do_not_go_together_are_refused(service: Any, mapped_flo
     [
         {"curl_free": True, "heights_m": [0.9, 1.5], "noise": "white"},
         {"kernel": "matern32+matern32", "robust": True},
+        {"refine": True},
     ],
 )
 def test_every_kind_of_map_can_be_built_and_asked(service: Any, mapped_floor: str, body: dict[str, Any]) -> None:
@@ -277,6 +279,8 @@ def test_every_kind_of_map_can_be_built_and_asked(service: Any, mapped_floor: st
     map_id = answer.json()["map"]["id"]
     shown = service.http.get(f"/v1/maps/{map_id}").json()
     assert shown["status"] == "ready"
+    quality = service.http.get(f"/v1/maps/{map_id}/quality").json()
+    assert bool(quality["refinement"]) == body.get("refine", False) == ("refinement" in shown["hyperparameters"])
     heights = body.get("heights_m")
     bounds = shown["bounds_m"]
     centre = [(bounds[0] + bounds[3]) / 2, (bounds[1] + bounds[4]) / 2, 1.2]
