@@ -1,7 +1,7 @@
 """Maps of refined walks against maps of the same walks as they are, forced even where the proof speaks against it.
 
 Without a folder: an analytic building whose field is known, walked eight times with labels off by 0.35 m per axis,
-smooth over 7 m of the path, at steel of three strengths; judged by the known field. With a folder (one folder per floor,
+smooth over 7 m of the path, at steel of three strengths; judged by the known field. With a folder (a folder per floor,
 walks of format indoor-location-2020): one walk in five held out, and not used by the refinement in any way; judged by
 those.
 
