@@ -17,6 +17,10 @@ from app.geometry import Array
 
 __all__ = ["Cleaned", "HardIron", "remove_hard_iron"]
 
+SIGNIFICANT = 4.0
+"""In sds, which are too small by half where attitudes err (clean sensors show up to 2.7 of them): a smaller offset may be
+a mistake, and to take it out would make one."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HardIron:
@@ -62,7 +66,7 @@ def remove_hard_iron(walks: Mapping[str, Samples], components: Components, known
     sessions = {label: sessions[label] for label in sorted(labels & sessions.keys())}
     alone = {name: samples for name, samples in sorted(turned.items()) if samples.session is None}
     surveys = {
-        name: known.surveys[name] if name in known.surveys else estimate_body_bias(samples)
+        name: known.surveys[name] if name in known.surveys else _significant(estimate_body_bias(samples))
         for name, samples in alone.items()
     }
     cleaned = remove_session_biases(walks, sessions)
@@ -75,3 +79,11 @@ def remove_hard_iron(walks: Mapping[str, Samples], components: Components, known
         if offset is not None:
             left[name] = offset_variance_uT2(cleaned[name], offset, components).mean(axis=0)
     return Cleaned(cleaned, HardIron(sessions, surveys), left)
+
+
+def _significant(bias: BodyBias | None) -> BodyBias | None:
+    """The offset, if it is larger than its own uncertainty explains."""
+    if bias is None:
+        return None
+    precision = np.linalg.pinv(bias.covariance_uT2, rcond=1e-6, hermitian=True)
+    return bias if bias.bias_body_uT @ precision @ bias.bias_body_uT > SIGNIFICANT**2 else None

@@ -50,6 +50,12 @@ def test_walks_of_unknown_attitude_are_left_alone(walks):
     assert not cleaned.offset_variance_uT2
 
 
+def test_a_clean_sensor_is_left_alone(walks):
+    clean = {name: magnetised(walk, np.zeros(3), None) for name, walk in walks.items()}
+    cleaned = remove_hard_iron(clean, "vector", HardIron())
+    assert all(cleaned.walks[name] is walk for name, walk in clean.items())
+
+
 def test_what_is_known_is_kept_and_a_new_survey_changes_no_other(walks):
     bad = {name: magnetised(walk, BIAS_UT, "morning") for name, walk in walks.items()}
     few = {name: bad[name] for name in ("survey-0", "survey-1")}
