@@ -18,8 +18,8 @@ from app.geometry import Array
 __all__ = ["Cleaned", "HardIron", "remove_hard_iron"]
 
 SIGNIFICANT = 4.0
-"""In sds, which are too small by half where attitudes err (clean sensors show up to 2.7 of them): a smaller offset may be
-a mistake, and to take it out would make one."""
+"""In sds, which are too small by half where attitudes err (clean sensors show up to 2.7 of them): a smaller offset may
+be a mistake, and to take it out would make one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
