@@ -62,7 +62,7 @@ def _step(point: Array, slope: Array, bounds: Array, curvature: Array, longest: 
     free = np.where(slope > 0.0, low < 0.0, high > 0.0)
     while free.any():
         pull = slope[free] + curvature[np.ix_(free, ~free)] @ step[~free]
-        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)], pull)
+        step[free] = -np.linalg.lstsq(curvature[np.ix_(free, free)], pull, rcond=None)[0]  # rounding may leave it flat
         past = (step < low) | (step > high)
         if not past.any():
             break
