@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Small matrices are slower on many BLAS threads than on one; processes give the parallelism.
+TEST_PROCESSES ?= 2
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
@@ -35,7 +36,7 @@ serve: install ## Run the API, the page and an embedded worker on port 8300
 	$(BIN)/isodyn serve $(ARGS)
 
 test: install-dev ## Install, and run all tests but the slow ones
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_PROCESSES) --dist loadfile $(ARGS)
 
 test-slow: install-dev ## Run the slow tests
 	$(BIN)/python -m pytest -m slow $(ARGS)
