@@ -26,7 +26,9 @@ from app.field.kernels import covariance
 from app.field.samples import Samples
 from app.geometry import Array, rotate_by_quaternion
 
-__all__ = ["BodyBias", "estimate_body_bias", "remove_body_bias", "without_body_biases"]
+__all__ = [
+    "BodyBias", "Stretches", "estimate_body_bias", "mean_over_stretches", "remove_body_bias", "without_body_biases",
+]  # fmt: skip
 
 STRETCH_M = 0.3
 MAX_STRETCHES = 400
@@ -40,13 +42,18 @@ _ITERATIONS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyBias:
-    """bias_body_uT (3,) left in the samples of a survey, across its mean vertical, and its covariance (3, 3) uT^2."""
+    """bias_body_uT (3,) that a sensor left in samples, and its covariance (3, 3) uT^2."""
 
     bias_body_uT: Array
     covariance_uT2: Array
 
+    @property
+    def sd_uT(self) -> Array:
+        """(3,) standard deviations."""
+        return np.asarray(np.sqrt(np.maximum(np.diagonal(self.covariance_uT2), 0.0)))
 
-class _Walk(NamedTuple):
+
+class Stretches(NamedTuple):
     """Means over stretches: place (n, 2), field (n, 3), body to building (n, 3, 3), distance walked (n,)."""
 
     position_m: Array
@@ -65,10 +72,11 @@ class _Fit(NamedTuple):
 
 
 def estimate_body_bias(samples: Samples) -> BodyBias | None:
-    """The constant offset in the body frame of one walk; None without attitude, or when it is too short to say."""
+    """The offset of one walk across its mean vertical; None without attitude, or when it is too short to say."""
     if samples.q_body_to_building is None or samples.frame != "building":
         return None
-    walk = _stretches(samples, samples.q_body_to_building)
+    stretch_m = max(STRETCH_M, float(samples.path_length_m()[-1]) / MAX_STRETCHES)
+    walk = mean_over_stretches(samples, samples.q_body_to_building, stretch_m)
     if len(walk.path_m) < FEWEST_STRETCHES:
         return None
     across = _across_vertical(walk.rotation)
@@ -91,12 +99,12 @@ def without_body_biases(walks: Mapping[str, Samples]) -> tuple[dict[str, Samples
     return {**walks, **corrected}, biases
 
 
-def _stretches(samples: Samples, q_body_to_building: Array) -> _Walk:
+def mean_over_stretches(samples: Samples, q_body_to_building: Array, stretch_m: float) -> Stretches:
+    """The walk as means over stretches of this length."""
     path_m = samples.path_length_m()
-    stretch_m = max(STRETCH_M, float(path_m[-1]) / MAX_STRETCHES)
     _, start, count = np.unique(np.floor(path_m / stretch_m), return_index=True, return_counts=True)
     rotation = Rotation.from_quat(q_body_to_building, scalar_first=True).as_matrix()
-    return _Walk(
+    return Stretches(
         *(
             np.add.reduceat(values, start, axis=0) / count.reshape(-1, *[1] * (values.ndim - 1))
             for values in (samples.p_building_m[:, :2], samples.B_uT, rotation, path_m)
@@ -110,7 +118,7 @@ def _across_vertical(rotation: Array) -> Array:
     return np.asarray(np.linalg.svd(up_body[None])[2][1:].T)
 
 
-def _fit(walk: _Walk, across: Array, length_m: float) -> _Fit:
+def _fit(walk: Stretches, across: Array, length_m: float) -> _Fit:
     """Generalised least squares at one length: the ambient field (3,) has a flat prior, the offset a Gaussian one."""
     n = len(walk.path_m)
     label_ratio = 6.0 * (LABEL_SD_M / length_m) ** 2

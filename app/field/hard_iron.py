@@ -12,7 +12,7 @@ import numpy as np
 
 from app.field.body_bias import BodyBias, estimate_body_bias, remove_body_bias
 from app.field.samples import Components, Samples
-from app.field.session_bias import SessionBias, estimate_session_biases, offset_variance_uT2, remove_session_biases
+from app.field.session_bias import estimate_session_biases, offset_variance_uT2, remove_session_biases
 from app.geometry import Array
 
 __all__ = ["Cleaned", "HardIron", "remove_hard_iron"]
@@ -26,7 +26,7 @@ be a mistake, and to take it out would make one."""
 class HardIron:
     """Offsets by session label, and by survey id for surveys of no session; None: nothing can be said of it."""
 
-    sessions: Mapping[str, SessionBias] = field(default_factory=dict)
+    sessions: Mapping[str, BodyBias] = field(default_factory=dict)
     surveys: Mapping[str, BodyBias | None] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, object]:
@@ -34,10 +34,7 @@ class HardIron:
         known = {name: bias for name, bias in self.surveys.items() if bias is not None}
         return {
             kind: {
-                name: {
-                    "bias_body_ut": bias.bias_body_uT.tolist(),
-                    "sd_ut": np.sqrt(np.maximum(np.diagonal(bias.covariance_uT2), 0.0)).tolist(),
-                }
+                name: {"bias_body_ut": bias.bias_body_uT.tolist(), "sd_ut": bias.sd_uT.tolist()}
                 for name, bias in biases.items()
             }
             for kind, biases in (("sessions", self.sessions), ("surveys", known))

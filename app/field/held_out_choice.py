@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.field.leave_one_out import HeldOutPrediction
-from app.field.measured import near_other_walks
+from app.field.measured import near_observations
 from app.field.noise_calibration import noise_sd_by_survey
 from app.field.observations import Walk, walk_bounds
 from app.field.spec import MapSpec, Progress
@@ -72,11 +72,11 @@ def held_out_nlpd(walks: Sequence[Walk], learned: Learned, spec: MapSpec) -> flo
     for tile in tiled.counts():
         fit = fit_tile(tiled, tile, learned, RASTER_M, np.zeros(1), spec.robust)
         predicted.add(tile, tiled.answered(tile), fit.held_out)
-    near = near_other_walks(walks, volume=False)
+    near = near_observations(walks, volume=False)
     error_uT, latent_uT2 = {}, {}
     for walk in walks:
-        name, first = walk.survey_id, np.unique(walk.stretch_of_sample, return_index=True)[1]
-        judged = near[name][first]
+        name = walk.survey_id
+        judged = near[name]
         error_uT[name] = (walk.field_uT - learned.ambient_uT - predicted.mean_uT[name])[judged]
         latent_uT2[name] = (predicted.variance_ratio[name] * np.square(learned.hyper.signal_sd_uT))[judged]
     needed_uT2 = {name: np.square(error) / 4.0 - latent_uT2[name] for name, error in error_uT.items()}

@@ -13,7 +13,7 @@ from app.field.raster import GridFrame
 from app.field.tiles import REACH_M
 from app.geometry import Array
 
-__all__ = ["MAX_SD_OF_PRIOR", "measured_cells", "near_other_walks"]
+__all__ = ["MAX_SD_OF_PRIOR", "measured_cells", "near_observations", "near_other_walks"]
 
 MAX_SD_OF_PRIOR = 0.9
 """A cell whose sd is above this share of the prior's has had less than a fifth of its variance explained."""
@@ -55,7 +55,13 @@ def _near_columns(frame: GridFrame, position_m: Array, resolution_m: float, reac
 
 
 def near_other_walks(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[np.bool_]]:
-    """Survey id -> (N,) samples within REACH_M of an observation of another survey; heights count in a volume."""
+    """Survey id -> (N,) samples whose observation is near another survey, as `near_observations`."""
+    near = near_observations(walks, volume)
+    return {walk.survey_id: near[walk.survey_id][walk.stretch_of_sample] for walk in walks}
+
+
+def near_observations(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[np.bool_]]:
+    """Survey id -> (n,) observations within REACH_M of one of another survey; heights count in a volume."""
     position_m = np.concatenate([walk.position_m for walk in walks])
     if not volume:
         position_m = position_m * [1.0, 1.0, 0.0]
@@ -68,7 +74,7 @@ def near_other_walks(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[n
     close = np.empty(len(key), dtype=np.bool_)
     close[order] = _near_others(position_m[order], survey[order], key[order], rows, REACH_M**2)
     parts = np.split(close, walk_bounds(walks)[1:-1])
-    return {walk.survey_id: part[walk.stretch_of_sample] for walk, part in zip(walks, parts, strict=True)}
+    return {walk.survey_id: part for walk, part in zip(walks, parts, strict=True)}
 
 
 @njit(cache=True)

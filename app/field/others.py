@@ -12,7 +12,7 @@ import numpy as np
 
 from app.field.hilbert import predict
 from app.field.observations import Walk, walk_bounds
-from app.field.statistics import add_evidence, marginalise
+from app.field.statistics import add_evidence
 from app.field.tile_fit import Learned
 from app.field.tiled_walks import TiledWalks
 from app.geometry import Array
@@ -42,8 +42,7 @@ def predict_from_others(walks: Sequence[Walk], learned: Learned, mapping: Collec
     mean_uT, variance_ratio = np.zeros((n, len(_AROUND_M), c)), np.ones((n, c))
     for tile in tiled.counts():
         basis = lattice.basis(tile)
-        surveys = tiled.statistics(tile, hyper.walk_noise_in(basis))
-        known = {name: marginalise(basis, name, surveys[name], hyper) for name in surveys if name in mapping}
+        known = {name: each for name, each in tiled.evidence(tile, hyper).items() if name in mapping}
         total = add_evidence(known.values()) if known else None
         for name, inside in tiled.answered(tile).items():
             if total is None or set(known) == {name}:

@@ -20,6 +20,7 @@ import numpy as np
 from app.field.hard_iron import Cleaned
 from app.field.hilbert_engine import estimate_by_hilbert
 from app.field.label_errors import displacements
+from app.field.measured import near_observations
 from app.field.observations import Walk, observe
 from app.field.others import FromOthers
 from app.field.refinement_proof import (
@@ -28,7 +29,6 @@ from app.field.refinement_proof import (
     fall_of_error,
     gain_in_density,
     gain_of_unseen,
-    near_others,
     predict_untouched,
     recovered_share,
 )
@@ -119,7 +119,7 @@ def refine(cleaned: Cleaned, spec: MapSpec, progress: Progress) -> Refinement:
     state = estimate_by_hilbert(walks, cleaned, coarse, None, lambda f, text: progress(0.1 * f, text)).state
     assert state is not None
     learned, components = state.learned, components_of(walks)
-    near = near_others(walks)
+    near = near_observations(walks, volume=False)
     progress(0.1, "correcting labels")
     found = displacements(walks, learned, components)
     progress(0.25, "correcting labels with known errors")

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from app.field.label_errors import LABEL_SD_M, displacements, fit_labels, label_prior, moved
-from app.field.measured import near_other_walks
 from app.field.observations import Walk
 from app.field.others import FromOthers, predict_from_others
 from app.field.spec import Progress
@@ -19,9 +18,16 @@ from app.field.tile_fit import Learned
 from app.geometry import Array
 
 __all__ = [
-    "Gain", "Near", "Predicted", "components_of", "fall_of_error", "gain_in_density", "gain_of_unseen", "near_others",
-    "predict_untouched", "recovered_share",
-]  # fmt: skip
+    "Gain",
+    "Near",
+    "Predicted",
+    "components_of",
+    "fall_of_error",
+    "gain_in_density",
+    "gain_of_unseen",
+    "predict_untouched",
+    "recovered_share",
+]
 
 FOLDS = 4
 INJECTED_SD_M = 0.35
@@ -99,13 +105,6 @@ def predict_untouched(
             predicted = predict_from_others(each, learned, {walk.survey_id for walk in mapping})
             judged.update((name, predicted[name]) for name in judging)
     return before, after
-
-
-def near_others(walks: Sequence[Walk]) -> dict[str, NDArray[np.bool_]]:
-    """Survey id -> (n,) observations whose first sample is near another walk, looked at from above."""
-    of_samples = near_other_walks(walks, volume=False)
-    starts = {walk.survey_id: np.unique(walk.stretch_of_sample, return_index=True)[1] for walk in walks}
-    return {name: of_samples[name][first] for name, first in starts.items()}
 
 
 def gain_in_density(

@@ -6,38 +6,32 @@ r^2 includes the field's own posterior variance, and what it is compared with al
 correlated error too, so that a well-modelled drift along the walk is not taken for outliers.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from app.field.hilbert import posterior
 from app.field.hyperparameters import Hyperparameters
-from app.field.statistics import Evidence, add_evidence, marginalise
+from app.field.statistics import Evidence, add_evidence
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Tile
-from app.geometry import Array
 
-__all__ = ["FREEDOM", "student_scales"]
+__all__ = ["FREEDOM", "student_evidence"]
 
 FREEDOM = 4.0
 ROUNDS = 3
 
 
-def student_scales(
-    tiled: TiledWalks, tile: Tile, hyper: Hyperparameters, evidence: Mapping[str, Evidence]
-) -> dict[str, Array]:
-    """Survey id -> (n,) factors on the variance of the white error of its observations in the tile; 1 is ordinary."""
-    basis = tiled.lattice.basis(tile)
-    parts = tiled.parts(tile)
-    scales: dict[str, Array] = {}
+def student_evidence(tiled: TiledWalks, tile: Tile, hyper: Hyperparameters) -> dict[str, Evidence]:
+    """Survey id -> its evidence in the tile, the variance of every observation's white error as large as it seems."""
+    basis, parts = tiled.lattice.basis(tile), tiled.parts(tile)
+    evidence = tiled.evidence(tile, hyper)
     for _ in range(ROUNDS):
         fitted = posterior(basis, add_evidence(evidence.values()), hyper)
+        scales = {}
         for survey_id, part in parts.items():
             mean_uT, variance_ratio = fitted.at(part.points_m)
             noise_ratio = hyper.bias_ratio + hyper.walk_ratio + hyper.white_ratio_in(basis, survey_id)
             squared = np.mean(np.square((part.deviation_uT - mean_uT) / hyper.signal_sd_uT), axis=1)
             squared = squared + variance_ratio.mean(axis=1)
             scales[survey_id] = (FREEDOM + squared / noise_ratio) / (FREEDOM + 1.0)
-        statistics = tiled.statistics(tile, hyper.walk_noise_in(basis), scales)
-        evidence = {name: marginalise(basis, name, each, hyper) for name, each in statistics.items()}
-    return scales
+        evidence = tiled.evidence(tile, hyper, scales)
+    return evidence

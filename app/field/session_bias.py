@@ -14,7 +14,7 @@ it too. What is not known of an offset stays with its walks as variance.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,12 @@ from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from app.field.body_bias import BodyBias
+from app.field.body_bias import BodyBias, mean_over_stretches, remove_body_bias
 from app.field.samples import Components, Samples
-from app.geometry import Array, rotate_by_quaternion
+from app.geometry import Array
 
 __all__ = [
-    "SessionBias", "estimate_session_biases", "offset_variance_uT2", "remove_session_biases", "unmet_session",
+    "estimate_session_biases", "offset_variance_uT2", "remove_session_biases", "unmet_session",
 ]  # fmt: skip
 
 STRETCH_M = 0.6
@@ -45,19 +45,6 @@ _ITERATIONS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SessionBias:
-    """bias_body_uT (3,) left in the samples of a session, and its posterior covariance (3, 3) uT^2."""
-
-    bias_body_uT: Array
-    covariance_uT2: Array
-
-    @property
-    def sd_uT(self) -> Array:
-        """(3,) standard deviations."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance_uT2)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Stretches:
     """Means over short stretches of all walks: place (n, 2), field (n, 3), body to building (n, 3, 3), labels (n,)."""
 
@@ -69,14 +56,14 @@ class _Stretches:
     session: NDArray[np.int64]
 
 
-def unmet_session(samples: Samples) -> SessionBias:
+def unmet_session(samples: Samples) -> BodyBias:
     """What is expected of the offset of a session that no other walk shares: none, with the prior's covariance."""
     assert samples.q_body_to_building is not None
     up = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()[:, 2].mean(axis=0)
-    return SessionBias(np.zeros(3), np.asarray(np.linalg.inv(WIDEST * _prior_precision(up))))
+    return BodyBias(np.zeros(3), np.asarray(np.linalg.inv(WIDEST * _prior_precision(up))))
 
 
-def offset_variance_uT2(samples: Samples, bias: BodyBias | SessionBias, components: Components) -> Array:
+def offset_variance_uT2(samples: Samples, bias: BodyBias, components: Components) -> Array:
     """(n, c) variance that what is unknown of the offset puts into every sample's features, to first order."""
     assert samples.q_body_to_building is not None
     rotation = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()
@@ -95,7 +82,7 @@ def _feature_slopes(B_uT: Array, components: Components) -> Array:
     return np.stack([direction, np.broadcast_to([0.0, 0.0, 1.0], B_uT.shape)], axis=1)
 
 
-def estimate_session_biases(walks: Mapping[str, Samples]) -> dict[str, SessionBias]:
+def estimate_session_biases(walks: Mapping[str, Samples]) -> dict[str, BodyBias]:
     """The offset of every session among walks of one floor that know their attitude and their session."""
     known = {name: walks[name] for name in sorted(walks) if _usable(walks[name])}
     sessions = sorted({str(samples.session) for samples in known.values()})
@@ -109,10 +96,10 @@ def estimate_session_biases(walks: Mapping[str, Samples]) -> dict[str, SessionBi
         [_prior_precision(stretches.rotation[stretches.session == k, 2].mean(axis=0)) for k in range(len(sessions))],
     )
     parts = [slice(3 * number, 3 * number + 3) for number in range(len(sessions))]
-    return {name: SessionBias(bias_uT[p], covariance[p, p]) for name, p in zip(sessions, parts, strict=True)}
+    return {name: BodyBias(bias_uT[p], covariance[p, p]) for name, p in zip(sessions, parts, strict=True)}
 
 
-def remove_session_biases(walks: Mapping[str, Samples], biases: Mapping[str, SessionBias]) -> dict[str, Samples]:
+def remove_session_biases(walks: Mapping[str, Samples], biases: Mapping[str, BodyBias]) -> dict[str, Samples]:
     """The walks with the offset of their session taken out, where one is known."""
     return {
         name: _without(samples, biases[str(samples.session)]) if samples.session in biases else samples
@@ -120,11 +107,10 @@ def remove_session_biases(walks: Mapping[str, Samples], biases: Mapping[str, Ses
     }
 
 
-def _without(samples: Samples, bias: SessionBias) -> Samples:
+def _without(samples: Samples, bias: BodyBias) -> Samples:
     if samples.q_body_to_building is None or samples.frame != "building":
         return samples
-    offset_uT = np.broadcast_to(bias.bias_body_uT, (len(samples), 3))
-    return replace(samples, B_uT=samples.B_uT - rotate_by_quaternion(samples.q_body_to_building, offset_uT))
+    return remove_body_bias(samples, bias)
 
 
 def _usable(samples: Samples) -> bool:
@@ -135,14 +121,8 @@ def _stretches(walks: Mapping[str, Samples], sessions: list[str]) -> _Stretches:
     parts: list[tuple[Array, ...]] = []
     for number, samples in enumerate(walks.values()):
         assert samples.q_body_to_building is not None
-        path_m = samples.path_length_m()
-        _, start, count = np.unique(np.floor(path_m / STRETCH_M), return_index=True, return_counts=True)
-        rotation = Rotation.from_quat(samples.q_body_to_building, scalar_first=True).as_matrix()
-        means = [
-            np.add.reduceat(values, start, axis=0) / count.reshape(-1, *[1] * (values.ndim - 1))
-            for values in (samples.p_building_m[:, :2], samples.B_uT, rotation, path_m)
-        ]
-        labels = np.full((2, len(start)), [[number], [sessions.index(str(samples.session))]])
+        means = mean_over_stretches(samples, samples.q_body_to_building, STRETCH_M)
+        labels = np.full((2, len(means.path_m)), [[number], [sessions.index(str(samples.session))]])
         parts.append((*means, *labels))
     position, field, rotation, path, walk, session = (np.concatenate(each) for each in zip(*parts, strict=True))
     return _Stretches(position, field, rotation, path, walk.astype(np.int64), session.astype(np.int64))

@@ -14,8 +14,8 @@ from app.field.hard_iron import HardIron
 from app.field.hilbert import Patch, SlabPosterior, posterior, predict
 from app.field.hyperparameters import Hyperparameters
 from app.field.raster import tile_cells
-from app.field.robust import student_scales
-from app.field.statistics import Evidence, add_evidence, marginalise
+from app.field.robust import student_evidence
+from app.field.statistics import add_evidence
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
@@ -72,10 +72,7 @@ def fit_tile(
 ) -> TileFit:
     """Fit one tile from the walks that cross it."""
     hyper, basis = learned.hyper, learned.lattice.basis(tile)
-    evidence = _evidence(tiled, tile, hyper, None)
-    if robust:
-        scales = student_scales(tiled, tile, hyper, evidence)
-        evidence = _evidence(tiled, tile, hyper, scales)
+    evidence = student_evidence(tiled, tile, hyper) if robust else tiled.evidence(tile, hyper)
     total = add_evidence(evidence.values())
     x_m, y_m = (tile_cells(learned.lattice, axis, tile, resolution_m) for axis in (0, 1))
     fitted = posterior(basis, total, hyper)
@@ -96,11 +93,3 @@ def _rounded(patch: Patch) -> Patch:
     """To single precision, in which a fit is kept: one that was kept and one that was not must not differ."""
     mean, gradient, variance = (values.astype(np.float32).astype(np.float64) for values in patch[:3])
     return Patch(mean, gradient, variance, patch.potential_uT_m)
-
-
-def _evidence(
-    tiled: TiledWalks, tile: Tile, hyper: Hyperparameters, white_scales: Mapping[str, Array] | None
-) -> dict[str, Evidence]:
-    basis = tiled.lattice.basis(tile)
-    surveys = tiled.statistics(tile, hyper.walk_noise_in(basis), white_scales)
-    return {name: marginalise(basis, name, survey, hyper) for name, survey in surveys.items()}

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from app.field.hyperparameters import Hyperparameters
 from app.field.observations import Walk, walk_bounds
-from app.field.statistics import SurveyStatistics, survey_statistics
+from app.field.statistics import Evidence, SurveyStatistics, marginalise, survey_statistics
 from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WalkNoise
 from app.geometry import Array
@@ -63,6 +64,14 @@ class TiledWalks:
             survey_id: survey_statistics(basis, *part, noise, white_scales[survey_id] if white_scales else None)
             for survey_id, part in self.parts(tile).items()
         }
+
+    def evidence(
+        self, tile: Tile, hyper: Hyperparameters, white_scales: Mapping[str, Array] | None = None
+    ) -> dict[str, Evidence]:
+        """Survey id -> its statistics with the offsets integrated out, in the walks' order."""
+        basis = self.lattice.basis(tile)
+        surveys = self.statistics(tile, hyper.walk_noise_in(basis), white_scales)
+        return {name: marginalise(basis, name, survey, hyper) for name, survey in surveys.items()}
 
     def answered(self, tile: Tile) -> dict[str, NDArray[np.int64]]:
         """Survey id -> indices among all observations of those at which the tile has a weight."""

@@ -75,14 +75,16 @@ def _earlier_states(session: Session, job: Job, map_row: Map) -> Plan:
         .where(Map.floor_id == job.floor_id, Map.state_sha256.is_not(None), Map.id != map_row.id)
         .order_by(Map.sequence.desc())
     ).all()
-    stale = [earlier.state_sha256 for earlier in kept[1:]]
-    for earlier in kept[1:]:
+    if not kept:
+        return {"previous": None, "stale_states": []}
+    newest, *older = kept
+    left = {earlier.state_sha256 for earlier in older} - {newest.state_sha256}  # equal fits share a blob
+    stale = sorted(sha256 for sha256 in left if sha256 is not None)
+    for earlier in older:
         earlier.state_sha256 = None
-    newest = kept[0] if kept else None
-    if newest is None or job.kind != REBUILD or newest.spec != map_row.spec:
-        return {"previous": None, "stale_states": stale}
     previous = {"state_sha256": newest.state_sha256, "components": newest.components, "survey_ids": newest.survey_ids}
-    return {"previous": previous, "stale_states": [sha256 for sha256 in stale if sha256 != newest.state_sha256]}
+    continued = job.kind == REBUILD and newest.spec == map_row.spec
+    return {"previous": previous if continued else None, "stale_states": stale}
 
 
 def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
@@ -138,13 +140,12 @@ def _changes(plan: Plan, fitted: FittedMap) -> Result:
     """What this build did beside the map before it."""
     now = {survey_id for survey_id, _, _ in plan["surveys"]}
     before = set(plan["previous"]["survey_ids"]) if fitted.continued else set()
-    tiles = len(fitted.state.tiles) if fitted.state else 0
     return {
         "hyperparameters": "kept" if fitted.continued else "learned",
         "surveys_added": sorted(now - before),
         "surveys_removed": sorted(before - now),
         "tiles_fitted": fitted.tiles_refitted if fitted.state else None,
-        "tiles": tiles or None,
+        "tiles": len(fitted.state.tiles) if fitted.state else None,
     }
 
 

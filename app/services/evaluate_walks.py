@@ -20,10 +20,11 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from app.errors import Fault, InvalidInput, UnreadableSurvey
+from app.field.body_bias import BodyBias
 from app.field.fit import fit_map
 from app.field.grid import FieldGrid
 from app.field.samples import Samples
-from app.field.session_bias import SessionBias, estimate_session_biases, remove_session_biases, unmet_session
+from app.field.session_bias import estimate_session_biases, remove_session_biases, unmet_session
 from app.field.spec import FittedMap, MapSpec, Noise, Score
 from app.geometry import Array, rotate_by_quaternion
 from app.positioning.fix import Fix, LocateOptions
@@ -138,7 +139,7 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
         floors = {floor_id: {name: walks[name] for name in hold_out(walks)[0]} for floor_id, walks in floors.items()}
     spec = replace(plan.spec, hard_iron=plan.session_bias)
     mapping = {floor_id: _mapping_samples(walks) for floor_id, walks in floors.items()}
-    biases: dict[str, dict[str, SessionBias] | None] = dict.fromkeys(floors)
+    biases: dict[str, dict[str, BodyBias] | None] = dict.fromkeys(floors)
     if plan.session_bias:
         biases = {floor_id: estimate_session_biases(samples) for floor_id, samples in mapping.items()}
         floors = {floor_id: calibrate_sessions(walks, biases[floor_id] or {}) for floor_id, walks in floors.items()}
@@ -175,7 +176,7 @@ def hold_out(walks: Mapping[str, object]) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in set(held_out)], held_out
 
 
-def calibrate_sessions(walks: Mapping[str, Walk], biases: Mapping[str, SessionBias]) -> dict[str, Walk]:
+def calibrate_sessions(walks: Mapping[str, Walk], biases: Mapping[str, BodyBias]) -> dict[str, Walk]:
     """The walks of a floor without the offset of their calibration session."""
     samples = remove_session_biases({name: walk.samples for name, walk in walks.items()}, biases)
     return {
@@ -184,7 +185,7 @@ def calibrate_sessions(walks: Mapping[str, Walk], biases: Mapping[str, SessionBi
     }
 
 
-def _calibrated(walk: Walk, biases: Mapping[str, SessionBias]) -> DeadReckoning | None:
+def _calibrated(walk: Walk, biases: Mapping[str, BodyBias]) -> DeadReckoning | None:
     reckoned, bias = walk.dead_reckoning, biases.get(str(walk.samples.session))
     if reckoned is None or bias is None:
         return reckoned
@@ -357,7 +358,7 @@ def _evaluated_floor(
     walks: Mapping[str, Walk],
     fitted: FittedMap,
     white: FittedMap,
-    biases: Mapping[str, SessionBias] | None,
+    biases: Mapping[str, BodyBias] | None,
 ) -> EvaluatedFloor:
     mapping, held_out = hold_out(walks)
     mapped_m = _mapped_places(walks)
@@ -381,7 +382,7 @@ def _evaluated_floor(
     )
 
 
-def _session_of(samples: Samples, biases: Mapping[str, SessionBias] | None) -> SessionBias | None:
+def _session_of(samples: Samples, biases: Mapping[str, BodyBias] | None) -> BodyBias | None:
     """What is known of the walk's session; None where nothing was taken out of any."""
     if biases is None or samples.session is None or samples.q_body_to_building is None:
         return None

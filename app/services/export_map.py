@@ -8,6 +8,7 @@ import io
 import warnings
 import zipfile
 from collections.abc import Mapping
+from threading import Lock
 from typing import Any, Literal
 
 import msgspec
@@ -22,6 +23,7 @@ from app.services.map_dataset import AXES, NOTHING, MapDataset, Variable, map_da
 
 __all__ = ["EXTENSIONS", "MEDIA_TYPES", "ExportFormat", "export_map"]
 
+_WARNINGS = Lock()  # their filters are the process's, not a thread's
 ExportFormat = Literal["netcdf", "zarr", "npz", "covjson", "csv"]
 MEDIA_TYPES: dict[ExportFormat, str] = {
     "netcdf": "application/x-netcdf",
@@ -112,7 +114,7 @@ def _zarr(dataset: MapDataset) -> bytes:
             name, data=variable.values, chunks=chunks, dimension_names=variable.dimensions,
             attributes=_plain(variable.attributes), fill_value=np.nan if name in dataset.data else 0,
         )  # fmt: skip
-    with warnings.catch_warnings():  # that the format's own text does not yet name consolidated metadata
+    with _WARNINGS, warnings.catch_warnings():  # that the format's own text does not yet name consolidated metadata
         warnings.simplefilter("ignore", UserWarning)
         zarr.consolidate_metadata(store, zarr_format=3)
     out = io.BytesIO()

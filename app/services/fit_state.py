@@ -17,7 +17,6 @@ from app.field.body_bias import BodyBias
 from app.field.hard_iron import HardIron
 from app.field.hilbert import Patch
 from app.field.hyperparameters import Hyperparameters
-from app.field.session_bias import SessionBias
 from app.field.tile_fit import FitState, HeldOutPart, Learned, TileFit
 from app.field.tiles import Lattice, Slab, Tile
 from app.services.artefacts import pack, unpack
@@ -96,13 +95,13 @@ def state_from_bytes(data: bytes) -> FitState:
     hyper = Hyperparameters(signal_sd_uT=arrays["signal_sd_uT"], **header["hyper"])
     learned = Learned(hyper, _lattice(header["lattice"]), arrays["ambient_uT"], header["samples"])
     hard_iron = HardIron(
-        {name: SessionBias(*map(np.array, bias)) for name, bias in header["sessions"].items()},
+        {name: BodyBias(*map(np.array, bias)) for name, bias in header["sessions"].items()},
         {name: BodyBias(*map(np.array, bias)) if bias else None for name, bias in header["alone"].items()},
     )
     return FitState(learned, arrays["heights_m"], hard_iron, tiles)
 
 
-def _listed(bias: SessionBias | BodyBias | None) -> list[list[Any]] | None:
+def _listed(bias: BodyBias | None) -> list[list[Any]] | None:
     return None if bias is None else [bias.bias_body_uT.tolist(), bias.covariance_uT2.tolist()]
 
 

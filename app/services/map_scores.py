@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 
+from app.field.body_bias import BodyBias
 from app.field.grid import FieldGrid
 from app.field.samples import Samples
-from app.field.session_bias import SessionBias, offset_variance_uT2
+from app.field.session_bias import offset_variance_uT2
 from app.geometry import Array
 
 __all__ = ["Estimate", "HeldOutWalk", "MapScore", "held_out_walk", "nlpd_gain", "score_map"]
@@ -72,7 +73,7 @@ class MapScore:
     rank_correlation: Estimate
 
 
-def held_out_walk(grid: FieldGrid, samples: Samples, mapped_m: Array, session: SessionBias | None) -> HeldOutWalk:
+def held_out_walk(grid: FieldGrid, samples: Samples, mapped_m: Array, session: BodyBias | None) -> HeldOutWalk:
     """One walk, its session's offset already taken out, against the map. mapped_m (m, 2): places of the map's walks."""
     near = near_mapped(samples, mapped_m)
     predicted = grid.at(samples.p_building_m[near])

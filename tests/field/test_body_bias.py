@@ -65,7 +65,7 @@ def test_the_estimate_equals_a_dense_process_with_the_offset_as_one_more_functio
     """The posterior of the offset when ambient field and offset are part of one dense covariance."""
     walk = turning_walk(room, np.random.default_rng(2), (5.0, -4.0, 0.0))
     assert walk.q_body_to_building is not None
-    stretches = body_bias._stretches(walk, walk.q_body_to_building)
+    stretches = body_bias.mean_over_stretches(walk, walk.q_body_to_building, body_bias.STRETCH_M)
     found = body_bias._fit(stretches, np.eye(3)[:, :2], 2.0)
     n = len(stretches.path_m)
     distance = np.linalg.norm(stretches.position_m[:, None] - stretches.position_m, axis=2)

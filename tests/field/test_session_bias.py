@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from app.field.body_bias import BodyBias
 from app.field.samples import Samples
 from app.field.session_bias import (
     PRIOR_SCALE_UT,
     PRIOR_VERTICAL_SCALE_UT,
-    SessionBias,
     estimate_session_biases,
     offset_variance_uT2,
     remove_session_biases,
@@ -111,6 +111,6 @@ def test_variance_left_is_that_of_the_features_of_drawn_offsets(components):
         Samples(walk.t_s[:1], walk.p_building_m[:1], walk.B_uT[:1] + turn.apply(b), "building").features(components)[0]
         for b in drawn
     ]
-    found = offset_variance_uT2(walk, SessionBias(np.zeros(3), root @ root.T), components)
+    found = offset_variance_uT2(walk, BodyBias(np.zeros(3), root @ root.T), components)
     assert found.shape == walk.features(components).shape
     np.testing.assert_allclose(found[0], np.var(features, axis=0), rtol=0.1)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+from app.field.body_bias import BodyBias
 from app.field.grid import FieldGrid
 from app.field.samples import Samples
-from app.field.session_bias import SessionBias
 from app.services.map_scores import HeldOutWalk, held_out_walk, nlpd_gain, score_map
 
 
@@ -84,6 +84,6 @@ def test_only_places_near_a_mapping_walk_are_judged_with_all_that_is_uncertain()
     plain = held_out_walk(grid, walk, mapped, None)
     np.testing.assert_allclose(plain.error_uT, [[1.0, 0.0, -1.0]])
     np.testing.assert_allclose(plain.variance_uT2, [[5.0, 5.0, 5.0]])
-    known = held_out_walk(grid, walk, mapped, SessionBias(np.zeros(3), np.diag([1.0, 2.0, 3.0])))
+    known = held_out_walk(grid, walk, mapped, BodyBias(np.zeros(3), np.diag([1.0, 2.0, 3.0])))
     np.testing.assert_allclose(known.variance_uT2, [[6.0, 7.0, 8.0]])
     np.testing.assert_allclose(known.latent_sd_uT, 1.0)
