@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from app.geometry import Array
 
@@ -44,33 +45,25 @@ def descend(
         promised = _promise(step, slope, curvature)
         if promised < tolerance:
             break
-        next_value, next_slope = objective(point + step)
+        next_point = np.clip(point + step, bounds[:, 0], bounds[:, 1])  # but for rounding it is within
+        next_value, next_slope = objective(next_point)
         gained, trusted = value - next_value, value - next_value > TRUSTED * promised
         curvature = _updated(curvature, step, next_slope - slope)
         longest = min(2.0 * longest, LONGEST_STEP) if trusted else SHORTENED * float(np.max(np.abs(step)))
         if gained > 0.0:
-            point, value, slope = point + step, next_value, next_slope
+            point, value, slope = next_point, next_value, next_slope
         if trusted and gained < tolerance:
             break
     return Minimum(point, value, curvature)
 
 
 def _step(point: Array, slope: Array, bounds: Array, curvature: Array, longest: float) -> Array:
-    """Towards the bottom of the parabola within the bounds: a variable that meets one stays, the others go on."""
-    low, high = (bounds - point[:, None]).T
-    step = np.zeros(len(point))
-    free = np.where(slope > 0.0, low < 0.0, high > 0.0)
-    while free.any():
-        pull = slope[free] + curvature[np.ix_(free, ~free)] @ step[~free]
-        step[free] = -np.linalg.lstsq(curvature[np.ix_(free, free)], pull, rcond=None)[0]  # rounding may leave it flat
-        past = (step < low) | (step > high)
-        if not past.any():
-            break
-        step, free = np.clip(step, low, high), free & ~past
-    downhill = np.clip(-slope, low, high)
-    bend = max(float(downhill @ curvature @ downhill), 1e-300)
-    downhill *= min(1.0, -float(slope @ downhill) / bend)
-    step = max(step, downhill, key=lambda each: _promise(each, slope, curvature))
+    """Towards the bottom of the parabola within the bounds, shortened as a whole."""
+    step, free = np.zeros(len(point)), bounds[:, 0] < bounds[:, 1]
+    size, axes = np.linalg.eigh(curvature[np.ix_(free, free)])
+    size = np.sqrt(np.maximum(size, 1e-14 * size[-1]))  # rounding may leave it flat
+    low, high = (bounds - point[:, None])[free].T
+    step[free] = lsq_linear((axes * size).T, -(axes.T @ slope[free]) / size, (low, high), method="bvls", tol=1e-14).x
     return np.asarray(step * min(1.0, longest / max(float(np.max(np.abs(step))), longest)))
 
 
