@@ -12,7 +12,6 @@ judged by sds brought down to what the errors of the other surveys show, where t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from scipy.special import betainc, chdtrc
 from app.field.change_point import find_change
 from app.field.leave_one_out import HeldOut
 from app.field.noise_calibration import NOMINAL_COVERAGE
+from app.field.ranks import ranked_without
 from app.field.spec import ComponentConsistency, ConsistencyReport, SegmentConsistency
 from app.geometry import Array
 
@@ -51,25 +51,12 @@ def check_surveys(
 
 
 def _medians_of_others(values: Sequence[Array]) -> Array:
-    """(s, c) per survey, the median of all others' values (n, c) together; infinite where the others have none.
-
-    All values are sorted once: without those of a survey at sorted places r_0 < r_1 ..., the j-th lies at
-    j + (how many r_t - t are at most j).
-    """
-    pooled = np.concatenate(values)
-    order = np.argsort(pooled, axis=0)
-    place = np.empty_like(order)
-    np.put_along_axis(place, order, np.arange(len(pooled))[:, None], axis=0)
-    bounds = np.cumsum([0, *map(len, values)])
-    medians = np.full((len(values), pooled.shape[1]), np.inf)
-    for survey, (start, stop) in enumerate(pairwise(bounds.tolist())):
-        others = len(pooled) - (stop - start)
-        middle = np.array([(others - 1) // 2, others // 2])
-        for c in range(pooled.shape[1] if others else 0):
-            before = np.sort(place[start:stop, c]) - np.arange(stop - start)
-            at = middle + np.searchsorted(before, middle, side="right")
-            medians[survey, c] = np.mean(pooled[order[at, c], c])
-    return medians
+    """(s, c) per survey, the median of all others' values (n, c) together; infinite where the others have none."""
+    own = np.array([len(each) for each in values])
+    others = own.sum() - own
+    middle = np.stack([np.maximum(others - 1, 0) // 2, others // 2], axis=1)
+    medians = ranked_without(values, middle).mean(axis=1)
+    return np.asarray(np.where(others[:, None] > 0, medians, np.inf))
 
 
 def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: float) -> ConsistencyReport:

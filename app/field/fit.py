@@ -18,7 +18,7 @@ from app.field.hard_iron import Cleaned, HardIron, remove_hard_iron
 from app.field.hilbert_engine import estimate_by_hilbert
 from app.field.leave_one_out import HeldOut, error_correlation_m, score
 from app.field.measured import measured_cells, near_other_walks
-from app.field.noise_calibration import noise_sd_by_survey, noise_sd_shown
+from app.field.noise_calibration import NEW, noise_sd_by_survey
 from app.field.observations import Walk, observe
 from app.field.refinement import Untouched, refine
 from app.field.samples import COMPONENT_NAMES, Samples
@@ -138,7 +138,8 @@ def _held_out(
         needed_uT2[name] = (np.square(error_uT[name]) / 4.0 - latent_uT2[name])[near[name]]
     scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
     believed_sd_uT = np.sqrt(np.square(estimate.error_sd_uT) + scatter_uT2)
-    shown_sd_uT = noise_sd_by_survey(needed_uT2, believed_sd_uT)
+    nothing = np.zeros((0, len(believed_sd_uT)))
+    shown_sd_uT = noise_sd_by_survey({**needed_uT2, NEW: nothing}, believed_sd_uT)
     held_out = {
         walk.survey_id: HeldOut(
             error_uT=error_uT[walk.survey_id],
@@ -148,7 +149,7 @@ def _held_out(
         )
         for walk in walks
     }
-    return held_out, noise_sd_shown(list(needed_uT2.values()), believed_sd_uT)
+    return held_out, shown_sd_uT[NEW]
 
 
 def _grid(
