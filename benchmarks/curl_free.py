@@ -97,7 +97,7 @@ class BlendedField:
         for tile, inside in self.lattice.answering(points_m).items():
             p, fit = points_m[inside], self._tiles[tile]
             wx, wy = (self.lattice.weight(axis, tile, p[:, axis]) for axis in (0, 1))
-            sx, sy = (self.lattice.weight_slope(axis, tile, p[:, axis]) for axis in (0, 1))
+            sx, sy = (self.lattice.weights(axis, tile, p[:, axis])[1] for axis in (0, 1))
             phi = fit.potential_uT_m(p) + self._constants[tile]
             B_uT[inside] += (wx * wy)[:, None] * fit.at(p)[0]
             B_uT[inside] -= np.column_stack([sx * wy * phi, wx * sy * phi, np.zeros(len(p))])

@@ -46,7 +46,7 @@ def by_subtraction(fitted: FittedMap, walks: Sequence[Walk]) -> tuple[dict[str, 
     variances = next(iter(state.tiles.values())).patch.variance_ratio.shape[0]
     predicted = HeldOutPrediction(state.learned.lattice, walks, variances)
     for tile, fit in state.tiles.items():
-        predicted.add(tile, tiled.answered(tile), fit.held_out)
+        predicted.add(tile, tiled.all_answered(tile), fit.held_out)
     return predicted.mean_uT, predicted.variance_ratio
 
 

@@ -71,7 +71,7 @@ def held_out_nlpd(walks: Sequence[Walk], learned: Learned, spec: MapSpec) -> flo
     predicted = HeldOutPrediction(learned.lattice, walks, 1)
     for tile in tiled.counts():
         fit = fit_tile(tiled, tile, learned, RASTER_M, np.zeros(1), spec.robust)
-        predicted.add(tile, tiled.answered(tile), fit.held_out)
+        predicted.add(tile, tiled.all_answered(tile), fit.held_out)
     near = near_observations(walks, volume=False)
     error_uT, latent_uT2 = {}, {}
     for walk in walks:

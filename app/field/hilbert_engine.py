@@ -59,7 +59,7 @@ def estimate_by_hilbert(
     blended = _blend(lattice, frame, spec, tiles)
     predicted = HeldOutPrediction(lattice, walks, len(blended.variance_ratio))
     for tile, fit in tiles.items():
-        predicted.add(tile, tiled.answered(tile), fit.held_out)
+        predicted.add(tile, tiled.all_answered(tile), fit.held_out)
     prior_sd_uT, error_sd_uT = (np.broadcast_to(sd, components) for sd in (hyper.signal_sd_uT, hyper.error_sd_uT))
     return FieldEstimate(
         frame=frame,

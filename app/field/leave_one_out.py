@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from app.field.blending import add_at_points
 from app.field.observations import Walk, walk_bounds
 from app.field.spec import Score
 from app.field.tile_fit import HeldOutPart
@@ -69,14 +70,13 @@ class HeldOutPrediction:
         """Survey id -> (n, v) variance of the latent field over the signal's."""
         return {survey_id: self._variance_ratio[start:stop] for survey_id, (start, stop) in self._bounds.items()}
 
-    def add(self, tile: Tile, answered: Mapping[str, NDArray[np.int64]], parts: Mapping[str, HeldOutPart]) -> None:
-        """What one tile predicts, at the observations (indices among all of them) it answers."""
-        for survey_id, part in parts.items():
-            inside = answered[survey_id]
-            x_m, y_m = self._points_m[inside, :2].T
-            weight = (self._lattice.weight(0, tile, x_m) * self._lattice.weight(1, tile, y_m))[:, None]
-            self._mean_uT[inside] += weight * part.mean_uT
-            self._variance_ratio[inside] += weight * (part.variance_ratio - 1.0)
+    def add(self, tile: Tile, inside: NDArray[np.int64], part: HeldOutPart) -> None:
+        """What one tile predicts, at the observations (indices among all of them) it answers; nothing, if it cannot."""
+        if len(part.mean_uT):
+            corner_m = np.array([self._lattice.answers_between(axis, tile) for axis in (0, 1)])
+            where = self._points_m, inside, corner_m, self._lattice.ramp_m
+            add_at_points(self._mean_uT, part.mean_uT, 0.0, *where)
+            add_at_points(self._variance_ratio, part.variance_ratio, 1.0, *where)
 
 
 def score(held_out: Mapping[str, HeldOut], measured_uT: Mapping[str, Array]) -> Score | None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from app.errors import InvalidInput
+from app.field.blending import add_cells
 from app.field.hilbert import Patch
 from app.field.observations import Walk
 from app.field.spec import MapSpec
@@ -87,14 +88,14 @@ def blend(lattice: Lattice, frame: GridFrame, resolution_m: float, patches: Mapp
     mean = np.zeros((len(shape.mean_uT), *frame.shape))
     gradient = np.zeros((*shape.gradient_uT_per_m.shape[:2], *frame.shape))
     variance = np.ones((len(shape.variance_ratio), *frame.shape))
-    for tile, patch in patches.items():
-        p = placed(lattice, frame, resolution_m, tile)
-        own = p.of(patch)
-        mean[p.cells] += p.weight * own.mean_uT
-        gradient[p.cells] += p.weight * own.gradient_uT_per_m
-        for axis in (0, 1):
-            gradient[axis][p.cells] += p.slope[axis] * own.mean_uT
-        variance[p.cells] += p.weight * (own.variance_ratio - 1.0)
+    columns, rows = ({tile[axis]: tile for tile in patches} for axis in (0, 1))
+    across = {i: _along(lattice, 0, tile, resolution_m, frame.x_m) for i, tile in columns.items()}
+    up = {j: _along(lattice, 1, tile, resolution_m, frame.y_m) for j, tile in rows.items()}
+    for (column, row), patch in patches.items():
+        (x, own_x, along_x), (y, own_y, along_y) = across[column], up[row]
+        own_mean, own_gradient, own_variance = (values[..., own_y, own_x] for values in patch[:3])
+        own = own_mean, own_gradient, own_variance
+        add_cells(mean[..., y, x], gradient[..., y, x], variance[..., y, x], own, along_x, along_y)
     return Blended(mean, gradient, variance)
 
 
@@ -119,15 +120,9 @@ class Placed:
 
 
 def placed(lattice: Lattice, frame: GridFrame, resolution_m: float, tile: Tile) -> Placed:
-    x_m, y_m = (tile_cells(lattice, axis, tile, resolution_m) for axis in (0, 1))
-    columns, own_columns = _overlap(frame.x_m, x_m)
-    rows, own_rows = _overlap(frame.y_m, y_m)
-    wx, sx, cx = (
-        f(0, tile, x_m[own_columns]) for f in (lattice.weight, lattice.weight_slope, lattice.weight_curvature)
-    )
-    wy, sy, cy = (
-        f(1, tile, y_m[own_rows])[:, None] for f in (lattice.weight, lattice.weight_slope, lattice.weight_curvature)
-    )
+    columns, own_columns, (wx, sx, cx) = _along(lattice, 0, tile, resolution_m, frame.x_m)
+    rows, own_rows, along_y = _along(lattice, 1, tile, resolution_m, frame.y_m)
+    wy, sy, cy = along_y[:, :, None]
     return Placed(
         (..., rows, columns),
         (..., own_rows, own_columns),
@@ -135,6 +130,15 @@ def placed(lattice: Lattice, frame: GridFrame, resolution_m: float, tile: Tile) 
         (sx * wy, wx * sy),
         (cx * wy, sx * sy, wx * cy),
     )
+
+
+def _along(
+    lattice: Lattice, axis: int, tile: Tile, resolution_m: float, centres_m: Array
+) -> tuple[slice, slice, Array]:
+    """Along one axis: the tile's cells among the centres, which of its own they are, and the weights (3, n) there."""
+    own_m = tile_cells(lattice, axis, tile, resolution_m)
+    cells, own = _overlap(centres_m, own_m)
+    return cells, own, lattice.weights(axis, tile, own_m[own])
 
 
 def _overlap(centres_m: Array, own_m: Array) -> tuple[slice, slice]:

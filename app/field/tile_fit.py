@@ -15,7 +15,7 @@ from app.field.hilbert import Patch, SlabPosterior, posterior, predict
 from app.field.hyperparameters import Hyperparameters
 from app.field.raster import tile_cells
 from app.field.robust import student_evidence
-from app.field.statistics import add_evidence
+from app.field.statistics import Evidence, add_evidence
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
@@ -37,7 +37,10 @@ class Learned:
 
 
 class HeldOutPart(NamedTuple):
-    """A survey's observations where a tile answers, from the others: mean (n, c) about the ambient, variance (n, v)."""
+    """The observations a tile answers, one survey after the other, each from the others: mean (n, c) about the ambient,
+
+    variance over the signal's (n, v).
+    """
 
     mean_uT: Array
     variance_ratio: Array
@@ -45,15 +48,15 @@ class HeldOutPart(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TileFit:
-    """surveys: those the tile was fitted from; patch: the field on the cells it answers; held_out: of every survey
+    """surveys: those the tile was fitted from; patch: the field on the cells it answers; held_out: of no observation
 
-    that something can be said of; borders (2, 4, n): the potential (uT m) along the borders of the core and the
+    where there is a single survey; borders (2, 4, n): the potential (uT m) along the borders of the core and the
     field's variance there over the signal's, to match with the neighbours'; empty when there is no potential.
     """
 
     surveys: tuple[str, ...]
     patch: Patch
-    held_out: Mapping[str, HeldOutPart]
+    held_out: HeldOutPart
     borders: Array
 
 
@@ -81,12 +84,22 @@ def fit_tile(
         points_m = learned.lattice.borders(tile, heights_m)
         known = np.stack([fitted.potential_uT_m(points_m), fitted.at(points_m)[1].mean(axis=1)])
         borders = known.reshape(2, 4, -1)
-    held_out = {}
-    if len(evidence) > 1:
-        for survey_id, inside in tiled.answered(tile).items():
-            others = total - evidence[survey_id]
-            held_out[survey_id] = HeldOutPart(*predict(basis, others, hyper, tiled.points_m[inside]))
+    held_out = _held_out(tiled, tile, learned, evidence, total)
     return TileFit(tuple(evidence), _rounded(fitted.patch(x_m, y_m, heights_m)), held_out, borders)
+
+
+def _held_out(
+    tiled: TiledWalks, tile: Tile, learned: Learned, evidence: Mapping[str, Evidence], total: Evidence
+) -> HeldOutPart:
+    """Every survey the tile answers from the others; of a single survey nothing can be said."""
+    basis, answered = learned.lattice.basis(tile), tiled.answered(tile)
+    if len(evidence) < 2 or not answered:
+        return HeldOutPart(np.zeros((0, total.target.shape[1])), np.zeros((0, 1)))
+    parts = [
+        predict(basis, total - evidence[survey_id], learned.hyper, tiled.points_m[inside])
+        for survey_id, inside in answered.items()
+    ]
+    return HeldOutPart(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 def _rounded(patch: Patch) -> Patch:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.field.hyperparameters import Hyperparameters
-from app.field.observations import Walk, walk_bounds
+from app.field.observations import Walk
 from app.field.statistics import Evidence, SurveyStatistics, marginalise, survey_statistics
 from app.field.tiles import Lattice, Tile
 from app.field.walk_noise import WalkNoise
@@ -31,7 +31,7 @@ class TiledWalks:
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> None:
         self.lattice = lattice
         self._survey_ids = [walk.survey_id for walk in walks]
-        self._bounds = walk_bounds(walks)
+        self._owner = np.repeat(np.arange(len(walks)), [len(walk) for walk in walks])
         self.points_m = np.concatenate([walk.position_m for walk in walks])
         self._path_m = np.concatenate([walk.path_m for walk in walks])
         self._deviation_uT = np.concatenate([walk.field_uT for walk in walks]) - ambient_uT
@@ -75,13 +75,13 @@ class TiledWalks:
 
     def answered(self, tile: Tile) -> dict[str, NDArray[np.int64]]:
         """Survey id -> indices among all observations of those at which the tile has a weight."""
-        inside = self._answered.get(tile)
-        return self._by_survey(inside) if inside is not None else {}
+        return self._by_survey(self.all_answered(tile))
+
+    def all_answered(self, tile: Tile) -> NDArray[np.int64]:
+        """The same of all surveys, one after the other."""
+        return self._answered.get(tile, np.zeros(0, dtype=np.int64))
 
     def _by_survey(self, members: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-        cuts = np.searchsorted(members, self._bounds).tolist()
-        return {
-            self._survey_ids[survey]: members[start:stop]
-            for survey, (start, stop) in enumerate(pairwise(cuts))
-            if stop > start
-        }
+        owner = self._owner[members]
+        cuts = [0, *(np.flatnonzero(owner[1:] != owner[:-1]) + 1).tolist(), len(members)]
+        return {self._survey_ids[owner[start]]: members[start:stop] for start, stop in pairwise(cuts) if stop > start}

@@ -6,15 +6,17 @@ across the overlap and sum to 1 everywhere. Tiles of a lattice with a slab reach
 """
 
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.field.basis import CosineBasis
+from app.field.blending import weights
 from app.field.hyperparameters import Basis
 from app.field.kernels import base_kernel
+from app.field.membership import cell_members
 from app.field.slab import SlabBasis
 from app.field.spec import BaseKernel, Kernel
 from app.geometry import Array
@@ -146,22 +148,16 @@ class Lattice:
 
     def weight(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
         """The tile's one-dimensional weight; a tile's weight at a point is the product over x and y."""
-        low, high = self._ramps(axis, tile, coordinate_m)
-        return np.asarray(_smooth_step(low) * _smooth_step(high))
+        return np.asarray(self.weights(axis, tile, coordinate_m)[0])
 
-    def weight_slope(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
-        """Derivative of `weight`, per metre."""
-        low, high = self._ramps(axis, tile, coordinate_m)
-        width = 2.0 * self.overlap * self.pitch_m
-        rise = _smooth_step_slope(low) * _smooth_step(high) - _smooth_step(low) * _smooth_step_slope(high)
-        return np.asarray(rise / width)
+    def weights(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
+        """(3, n) `weight` at coordinates (n,), and its first and second derivative over metres."""
+        return np.asarray(weights(coordinate_m, *self.answers_between(axis, tile), self.ramp_m))
 
-    def weight_curvature(self, axis: int, tile: Tile, coordinate_m: Array) -> Array:
-        """Second derivative of `weight`, per square metre."""
-        low, high = self._ramps(axis, tile, coordinate_m)
-        width = 2.0 * self.overlap * self.pitch_m
-        bend = _smooth_step_curvature(low) * _smooth_step(high) + _smooth_step(low) * _smooth_step_curvature(high)
-        return np.asarray((bend - 2.0 * _smooth_step_slope(low) * _smooth_step_slope(high)) / width**2)
+    @property
+    def ramp_m(self) -> float:
+        """Over which a weight rises."""
+        return 2.0 * self.overlap * self.pitch_m
 
     def borders(self, tile: Tile, heights_m: Array) -> Array:
         """(4 n, 3) points along the left, right, lower and upper border of a core; tiles that share one share them."""
@@ -173,41 +169,11 @@ class Lattice:
         middle_m = 0.5 * (heights_m[0] + heights_m[-1])
         return np.column_stack([x, y, np.full(len(x), middle_m)])
 
-    def _ramps(self, axis: int, tile: Tile, coordinate_m: Array) -> tuple[Array, Array]:
-        start, stop = self.answers_between(axis, tile)
-        width = 2.0 * self.overlap * self.pitch_m
-        return np.clip((coordinate_m - start) / width, 0.0, 1.0), np.clip((stop - coordinate_m) / width, 0.0, 1.0)
-
     def _members(self, points_m: Array, reach: float) -> dict[Tile, NDArray[np.int64]]:
-        scaled = points_m / self.pitch_m
-        home = np.floor(scaled).astype(np.int64)
-        past = scaled - home
-        inside = {-1: past <= reach, 0: np.ones(past.shape, dtype=np.bool_), 1: past >= 1.0 - reach}
-        tiles, indices = [], []
-        for right, up in product(inside, inside):
-            near = np.flatnonzero(inside[right][:, 0] & inside[up][:, 1])
-            tiles.append(home[near] + (right, up))
-            indices.append(near)
-        tile, index = np.concatenate(tiles), np.concatenate(indices)
-        order = np.lexsort((index, tile[:, 1], tile[:, 0]))
-        tile, index = tile[order], index[order]
-        starts = np.flatnonzero(np.any(tile[1:] != tile[:-1], axis=1)) + 1
-        cuts = [0, *starts.tolist(), len(order)] if len(order) else []
-        return {Tile(*tile[start].tolist()): index[start:stop] for start, stop in pairwise(cuts)}
+        cells, index, bounds = cell_members(points_m, self.pitch_m, reach)
+        places = zip(cells.tolist(), pairwise(bounds), strict=True)
+        return {Tile(*cell): index[start:stop] for cell, (start, stop) in places}
 
 
 def _pitch_m(least_m: float) -> float:
     return next((pitch for pitch in PITCHES_M if pitch >= least_m), PITCHES_M[-1])
-
-
-def _smooth_step(t: Array) -> Array:
-    """0 to 1 with two continuous derivatives; s(t) + s(1 - t) = 1."""
-    return np.asarray(t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
-
-
-def _smooth_step_slope(t: Array) -> Array:
-    return np.asarray(30.0 * t**2 * (1.0 - t) ** 2)
-
-
-def _smooth_step_curvature(t: Array) -> Array:
-    return np.asarray(60.0 * t * (1.0 - t) * (1.0 - 2.0 * t))

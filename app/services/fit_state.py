@@ -25,7 +25,7 @@ __all__ = ["LARGEST_BYTES", "state_from_bytes", "state_to_bytes"]
 
 LARGEST_BYTES = 400_000_000
 """A larger state is not kept: reading it would cost as much as fitting anew."""
-_VERSION = f"{__version__}-1"
+_VERSION = f"{__version__}-2"
 
 
 def state_to_bytes(state: FitState) -> bytes | None:
@@ -42,14 +42,12 @@ def state_to_bytes(state: FitState) -> bytes | None:
         double.add(fit.borders)
         if patch.potential_uT_m is not None:
             double.add(patch.potential_uT_m)
-        for part in fit.held_out.values():
-            double.add(part.mean_uT)
-            double.add(part.variance_ratio)
+        double.add(fit.held_out.mean_uT)
+        double.add(fit.held_out.variance_ratio)
         tiles.append(
             [
                 list(tile),
                 [number[survey_id] for survey_id in fit.surveys],
-                [number[survey_id] for survey_id in fit.held_out],
                 patch.potential_uT_m is not None,
             ]
         )
@@ -87,11 +85,11 @@ def state_from_bytes(data: bytes) -> FitState:
     double = _arrays(arrays["double"], header["shapes"][1])
     surveys: list[str] = header["surveys"]
     tiles = {}
-    for place, crossing, held_out, has_potential in header["tiles"]:
+    for place, crossing, has_potential in header["tiles"]:
         mean, gradient, variance, borders = next(single), next(single), next(single), next(double)
         patch = Patch(mean, gradient, variance, next(double) if has_potential else None)
-        parts = {surveys[index]: HeldOutPart(next(double), next(double)) for index in held_out}
-        tiles[Tile(*place)] = TileFit(tuple(surveys[index] for index in crossing), patch, parts, borders)
+        held_out = HeldOutPart(next(double), next(double))
+        tiles[Tile(*place)] = TileFit(tuple(surveys[index] for index in crossing), patch, held_out, borders)
     hyper = Hyperparameters(signal_sd_uT=arrays["signal_sd_uT"], **header["hyper"])
     learned = Learned(hyper, _lattice(header["lattice"]), arrays["ambient_uT"], header["samples"])
     hard_iron = HardIron(

@@ -21,7 +21,7 @@ def test_weight_slope_is_the_derivative_of_the_weight(x):
     lattice, at, h = Lattice(8.0), np.array([x]), 1e-5
     tile = Tile(int(np.floor(x / 8.0)), 0)
     numeric = (lattice.weight(0, tile, at + h) - lattice.weight(0, tile, at - h)) / (2 * h)
-    assert np.allclose(lattice.weight_slope(0, tile, at), numeric, atol=1e-5)
+    assert np.allclose(lattice.weights(0, tile, at)[1], numeric, atol=1e-5)
 
 
 def test_a_tile_is_fitted_from_every_point_it_answers_and_more():
@@ -41,3 +41,14 @@ def test_tiles_do_not_depend_on_the_other_points():
     points = np.random.default_rng(0).uniform(-9.0, 9.0, (100, 2))
     alone = {tile for p in points[:10] for tile in lattice.fitting(p[None])}
     assert alone <= set(lattice.fitting(points))
+
+
+def test_points_far_apart_are_grouped_as_those_side_by_side():
+    points = np.random.default_rng(1).uniform(-9.0, 9.0, (200, 2))
+    far = np.vstack([points, [[4e7, -3e7]]])
+    together, alone = Lattice(4.0).fitting(far), Lattice(4.0).fitting(points)
+    assert list(together) == sorted(together)
+    assert {tile: inside.tolist() for tile, inside in together.items() if 200 not in inside} == {
+        tile: inside.tolist() for tile, inside in alone.items()
+    }
+    assert Lattice(4.0).fitting(np.zeros((0, 2))) == {}
