@@ -37,9 +37,9 @@ def cell_members(points_m: Array, pitch_m: float, reach: float) -> tuple[Indices
 
 @njit(cache=True)
 def _near_cells(scaled: Array, first: Indices, rows: int, reach: float) -> tuple[Indices, Indices]:
-    """Key of every cell near a point, and the point, in order of points; reach at most half a pitch."""
-    key = np.empty(4 * len(scaled), dtype=np.int64)
-    index = np.empty(4 * len(scaled), dtype=np.int64)
+    """Key of every cell near a point, and the point, in order of points."""
+    key = np.empty(9 * len(scaled), dtype=np.int64)
+    index = np.empty(9 * len(scaled), dtype=np.int64)
     count = 0
     for i in range(len(scaled)):
         column, row = np.floor(scaled[i, 0]), np.floor(scaled[i, 1])

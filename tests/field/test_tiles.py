@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from app.field.tiles import Lattice, Tile
 
 COORDINATES = st.floats(-200.0, 200.0, allow_nan=False)
+Lattice(4.0).weight(0, next(iter(Lattice(4.0).answering(np.zeros((1, 2))))), np.zeros(1))  # compiles, before any clock
 
 
 @given(x=COORDINATES, y=COORDINATES, pitch=st.sampled_from([1.5, 4.0, 16.0]))
@@ -52,3 +53,7 @@ def test_points_far_apart_are_grouped_as_those_side_by_side():
         tile: inside.tolist() for tile, inside in alone.items()
     }
     assert Lattice(4.0).fitting(np.zeros((0, 2))) == {}
+
+
+def test_a_point_as_far_from_both_neighbours_belongs_to_all_of_them():
+    assert len(Lattice(4.0, margin=0.5).fitting(np.full((1, 2), 2.0))) == 9
