@@ -54,7 +54,7 @@ def find_change(held_out: HeldOut, names: tuple[str, ...], correlation_m: float)
         return None
     path_m = held_out.path_m[judged] - held_out.path_m[judged[0]]
     cell_m = max(CELL_M, float(path_m[-1]) / MOST_CELLS)
-    _, first = np.unique(np.floor(path_m / cell_m), return_index=True)
+    first = np.append(0, np.flatnonzero(np.diff(np.floor(path_m / cell_m))) + 1)
     split = _clearest(held_out.standardised, first, cell_m, max(correlation_m, cell_m / 2.0))
     if split is None or split.log_p.min() > np.log(CHANGE_CHANCE):
         return None
@@ -83,20 +83,16 @@ def _component(name: str, before_uT: Array, after_uT: Array) -> ComponentChange:
 
 def _clearest(standardised: Array, first: NDArray[np.intp], cell_m: float, correlation_m: float) -> _Split | None:
     """The stretch of cells that differs most clearly from the rest; None when none differs by enough to matter."""
-    z = np.clip(standardised, -CLIP_SD, CLIP_SD)
-    features = np.hstack([z, np.abs(z)])
-    samples = np.diff(np.append(first, len(z)))[:, None]
-    cells, count = len(first), features.shape[1]
-    mean, square = (np.add.reduceat(f, first, axis=0) / samples for f in (features, np.square(features)))
+    mean, square = _cell_means(standardised, np.append(first, len(standardised)))
+    cells, count = mean.shape
     total = np.vstack([np.zeros(count), np.cumsum(mean, axis=0)])
     least = np.repeat([CALIBRATED_SD, CALIBRATED_MAGNITUDE_SD], count // 2)
     lengths_m = np.repeat([correlation_m, max(correlation_m, LEAST_MAGNITUDE_CORRELATION_M)], count // 2)
     shortest = int(np.ceil(max(SHORTEST_M, CORRELATION_LENGTHS * correlation_m) / cell_m))
     independent = max(2.0, cells * cell_m / (2.0 * correlation_m))
     clearest = None
-    for switch, places in ((True, independent), (False, independent**2 / 2.0)):
-        arguments = square.sum(axis=0), np.square(least), 2.0 * lengths_m / cell_m, shortest, switch
-        start, stop, statistic = _largest_statistic(total, *arguments)
+    splits = _clearest_splits(total, square.sum(axis=0), np.square(least), 2.0 * lengths_m / cell_m, shortest)
+    for (start, stop, statistic), places in zip(splits, (independent, independent**2 / 2.0), strict=True):
         log_p = np.minimum(log_ndtr(-statistic) + np.log(2.0 * count * places), 0.0)
         if stop and (clearest is None or log_p.min() < clearest.log_p.min()):
             clearest = _Split(start, stop, log_p)
@@ -104,32 +100,75 @@ def _clearest(standardised: Array, first: NDArray[np.intp], cell_m: float, corre
 
 
 @njit(cache=True)
-def _largest_statistic(
-    total: Array, square: Array, least_square: Array, cells_per_error: Array, shortest: int, switch: bool
-) -> tuple[int, int, Array]:
-    """Over stretches of at least `shortest` cells, the start, stop and statistics (f,) of the clearest; stop 0: none.
+def _cell_means(standardised: Array, bounds: NDArray[np.intp]) -> tuple[Array, Array]:
+    """(cells, 2 c) mean of the clipped errors (n, c) of every cell and of their magnitudes, and of their squares."""
+    components = standardised.shape[1]
+    mean, square = np.zeros((len(bounds) - 1, 2 * components)), np.zeros((len(bounds) - 1, 2 * components))
+    for cell in range(len(mean)):
+        for i in range(bounds[cell], bounds[cell + 1]):
+            for c in range(components):
+                z = min(max(standardised[i, c], -CLIP_SD), CLIP_SD)
+                mean[cell, c] += z
+                mean[cell, components + c] += abs(z)
+                square[cell, c] += z * z
+        mean[cell] /= bounds[cell + 1] - bounds[cell]
+        square[cell] /= bounds[cell + 1] - bounds[cell]
+    square[:, components:] = square[:, :components]
+    return mean, square
 
-    total (n + 1, f): cumulated features of the cells; square (f,): their summed squares; switch: only stretches that
-    reach an end of the walk, or only those that do not. A feature that changes too little to matter has statistic 0.
+
+def _clearest_splits(
+    total: Array, square: Array, least_square: Array, cells_per_error: Array, shortest: int
+) -> tuple[tuple[int, int, Array], tuple[int, int, Array]]:
+    """Over stretches of at least `shortest` cells, the start, stop and statistics (f,) of the clearest that reaches an
+
+    end of the walk and of the clearest that does not; stop 0: none. total (n + 1, f): cumulated features of the cells;
+    square (f,): their summed squares. A feature that changes too little to matter has statistic 0.
+
+    Means of a stretch of k of n cells and of the rest differ by n / k (n - k) of what the centred sums do between its
+    ends: lengths of which no stretch can differ by enough are passed over.
     """
+    cells = len(total) - 1
+    centred = total - np.linspace(0.0, 1.0, cells + 1)[:, None] * total[-1]
+    inside = np.arange(cells + 1)
+    enough: Array = (LEAST_CHANGE * (1.0 - 1e-9) / cells) * np.asarray(inside * (cells - inside), np.float64)
+    lengths = np.flatnonzero(enough <= np.ptp(centred, axis=0).max())
+    lengths = lengths[(lengths >= shortest) & (lengths <= cells - shortest)]
+    switch, other = _splits(total, centred, enough, lengths, square, least_square, cells_per_error)
+    return switch, other
+
+
+@njit(cache=True)
+def _splits(
+    total: Array,
+    centred: Array,
+    enough: Array,
+    lengths: NDArray[np.int64],
+    square: Array,
+    least_square: Array,
+    cells_per_error: Array,
+) -> tuple[tuple[int, int, Array], tuple[int, int, Array]]:
     cells, features = len(total) - 1, total.shape[1]
-    best, best_start, best_stop = 0.0, 0, 0
-    here, chosen = np.zeros(features), np.zeros(features)
-    for start in range(cells):
-        for stop in range(start + shortest, cells + 1):
-            inside, outside = stop - start, cells - stop + start
-            if outside < shortest or (start == 0 or stop == cells) != switch:
-                continue
-            largest = 0.0
+    best, ends = np.zeros(2), np.zeros((2, 2), dtype=np.int64)
+    here, chosen = np.zeros(features), np.zeros((2, features))
+    for inside in lengths:
+        outside = cells - inside
+        for start in range(outside + 1):
+            stop, largest = start + inside, 0.0
             for f in range(features):
+                here[f] = 0.0
+                if abs(centred[stop, f] - centred[start, f]) < enough[inside]:
+                    continue
                 part = total[stop, f] - total[start, f]
                 inner, outer = part / inside, (total[cells, f] - part) / outside
-                within = (square[f] - inside * inner**2 - outside * outer**2) / cells
-                variance = max(within, least_square[f]) * cells_per_error[f] * (1.0 / inside + 1.0 / outside)
                 difference = abs(inner - outer)
-                here[f] = difference / np.sqrt(variance) if difference >= LEAST_CHANGE else 0.0
-                largest = max(largest, here[f])
-            if largest > best:
-                best, best_start, best_stop = largest, start, stop
-                chosen[:] = here
-    return best_start, best_stop, chosen
+                if difference >= LEAST_CHANGE:
+                    within = (square[f] - inside * inner**2 - outside * outer**2) / cells
+                    variance = max(within, least_square[f]) * cells_per_error[f] * (1.0 / inside + 1.0 / outside)
+                    here[f] = difference / np.sqrt(variance)
+                    largest = max(largest, here[f])
+            k = 0 if start == 0 or stop == cells else 1
+            if largest > best[k] or (largest == best[k] > 0.0 and start < ends[k, 0]):
+                best[k], ends[k, 0], ends[k, 1] = largest, start, stop
+                chosen[k] = here
+    return (ends[0, 0], ends[0, 1], chosen[0]), (ends[1, 0], ends[1, 1], chosen[1])

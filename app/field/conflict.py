@@ -8,10 +8,12 @@ root-mean-square error against the map of the others, in predictive sds: 1 is wh
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from app.field.leave_one_out import HeldOut
 from app.field.observations import Walk
+from app.field.tally import means_of_places
 from app.field.tiles import REACH_M
 from app.geometry import Array
 
@@ -47,12 +49,9 @@ def quality_layers(
 
 def _squared_error(walk: Walk, held_out: HeldOut) -> Array:
     """(n,) squared error of every observation in predictive variances, mean over components; NaN where not judged."""
-    n, judged = len(walk), held_out.judged
-    stretch = walk.stretch_of_sample[judged]
-    counts = np.bincount(stretch, minlength=n)
-    z = np.stack([np.bincount(stretch, column, n) for column in held_out.standardised.T], axis=1)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.mean(np.square(z / counts[:, None]), axis=1))
+    z, stretch = held_out.standardised, walk.stretch_of_sample[held_out.judged]
+    z, _ = means_of_places(z, stretch, np.ones(len(z), dtype=np.bool_), len(walk))
+    return np.asarray(np.mean(np.square(z), axis=1))
 
 
 def _layer(x_m: Array, y_m: Array, points: Sequence[Array], errors: Sequence[Array]) -> tuple[Array, Array]:
@@ -89,17 +88,40 @@ def _spread(
     disc = np.hypot(dx, dy) * step_m <= REACH_M + 1e-9
     low, high = indices.min(axis=0) - reach, indices.max(axis=0) + reach
     wide, tall = (high - low + 1).tolist()
-    cell, place = np.unique((indices - low) @ [1, wide], return_inverse=True)
-    judged = np.isfinite(error)
-    known = np.bincount(place[judged], minlength=len(cell))
-    mean = np.bincount(place[judged], error[judged], len(cell)) / np.maximum(known, 1)
-    around = (cell[:, None] + (dy * wide + dx)[disc]).ravel()
-    near, weight, total = (
-        np.bincount(around, None if each is None else np.repeat(each, disc.sum()), tall * wide).reshape(tall, wide)
-        for each in (None, np.minimum(known, 1), mean)
-    )
+    near, weight, total = _around(indices - low, error, disc, tall, wide)
     (x0, y0), (x1, y1) = np.maximum(low, 0), np.minimum(high + 1, shape[::-1])
     part = slice(y0 - low[1], y1 - low[1]), slice(x0 - low[0], x1 - low[0])
     weight = weight[part]
     box = slice(int(y0), int(y1)), slice(int(x0), int(x1))
     return box, near[part] > 0, weight > 0, total[part] / np.maximum(weight, 1)
+
+
+@njit(cache=True)
+def _around(
+    indices: Indices, error: Array, disc: NDArray[np.bool_], tall: int, wide: int
+) -> tuple[Indices, Indices, Array]:
+    """(tall, wide) of every cell, over the cells around it: how many are observed, how many judged, the sum of errors.
+
+    Of every observed cell its mean error counts; disc (2 r + 1, 2 r + 1): what is around.
+    """
+    seen, known, mean = np.zeros((tall, wide)), np.zeros((tall, wide)), np.zeros((tall, wide))
+    for i in range(len(indices)):
+        x, y = indices[i]
+        seen[y, x] = 1.0
+        if np.isfinite(error[i]):
+            known[y, x] += 1.0
+            mean[y, x] += error[i]
+    near, weight = np.zeros((tall, wide), dtype=np.int64), np.zeros((tall, wide), dtype=np.int64)
+    total, reach = np.zeros((tall, wide)), len(disc) // 2
+    for y in range(reach, tall - reach):
+        for x in range(reach, wide - reach):
+            if seen[y, x] == 0.0:
+                continue
+            for dy in range(-reach, reach + 1):
+                for dx in range(-reach, reach + 1):
+                    if disc[dy + reach, dx + reach]:
+                        near[y + dy, x + dx] += 1
+                        if known[y, x] > 0.0:
+                            weight[y + dy, x + dx] += 1
+                            total[y + dy, x + dx] += mean[y, x] / known[y, x]
+    return near, weight, total

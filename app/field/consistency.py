@@ -22,6 +22,7 @@ from app.field.leave_one_out import HeldOut
 from app.field.noise_calibration import NOMINAL_COVERAGE
 from app.field.ranks import ranked_without
 from app.field.spec import ComponentConsistency, ConsistencyReport, SegmentConsistency
+from app.field.tally import Tally
 from app.geometry import Array
 
 __all__ = ["MIN_JUDGED", "check_consistency", "check_surveys"]
@@ -61,61 +62,61 @@ def _medians_of_others(values: Sequence[Array]) -> Array:
 
 def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: float) -> ConsistencyReport:
     """The report of one survey, given its errors against the others' map and how far errors stay correlated."""
-    judged = int(np.count_nonzero(held_out.judged))
+    bounds = _segment_bounds(held_out.path_m)
+    runs = held_out.tally(bounds)
+    judged = int(runs.samples.sum())
     if judged < MIN_JUDGED:
         reason = f"{judged} of its samples are near another survey, {MIN_JUDGED} are needed: survey the area again"
         return ConsistencyReport("unjudged", None, judged, None, reason=reason)
-    coverage, p_values, acceptable = _judge(held_out, np.flatnonzero(held_out.judged), correlation_m)
-    error_uT, sd_uT = held_out.error_uT[held_out.judged], held_out.sd_uT[held_out.judged]
+    whole, heard = runs.whole(), np.flatnonzero(runs.samples >= MIN_JUDGED)
+    coverage, p_values, acceptable = _judge(whole, correlation_m)
+    rmse_uT, mean_sd_uT = np.sqrt(whole.squared_uT2[0] / judged), whole.sd_uT[0] / judged
     components = tuple(
         ComponentConsistency(
             component=name,
-            coverage_2sigma=float(coverage[c]),
-            seed_2sigma_96=bool(coverage[c] >= SEED_COVERAGE),
-            rmse_ut=float(np.sqrt(np.mean(np.square(error_uT[:, c])))),
-            mean_sd_ut=float(np.mean(sd_uT[:, c])),
-            p_value=float(p_values[c]),
+            coverage_2sigma=float(coverage[0, c]),
+            seed_2sigma_96=bool(coverage[0, c] >= SEED_COVERAGE),
+            rmse_ut=float(rmse_uT[c]),
+            mean_sd_ut=float(mean_sd_uT[c]),
+            p_value=float(p_values[0, c]),
         )
         for c, name in enumerate(names)
     )
-    segments = _segments(held_out, correlation_m)
-    consistent = acceptable and all(segment.consistent for segment in segments)
+    of_segments, _, accepted = _judge(runs.at(heard), correlation_m)
+    segments = tuple(
+        SegmentConsistency(int(bounds[run]), int(bounds[run + 1]), tuple(covered), good)
+        for run, covered, good in zip(heard, of_segments.tolist(), accepted.tolist(), strict=True)
+    )
     return ConsistencyReport(
-        status="consistent" if consistent else "inconsistent",
+        status="consistent" if acceptable[0] and accepted.all() else "inconsistent",
         seed_2sigma_96=all(component.seed_2sigma_96 for component in components),
         judged_samples=judged,
-        nlpd=held_out.nlpd,
+        nlpd=whole.nlpd,
         components=components,
         segments=segments,
         change_point=find_change(held_out, names, correlation_m),
     )
 
 
-def _segments(held_out: HeldOut, correlation_m: float) -> tuple[SegmentConsistency, ...]:
-    """Stretches of about ten metres; those with too few judged samples are left out."""
-    stretch = np.floor(held_out.path_m / SEGMENT_M).astype(np.int64)
-    cuts = np.flatnonzero(np.diff(stretch)) + 1
-    bounds = np.concatenate([[0], cuts, [len(stretch)]])
-    segments = []
-    for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        indices = start + np.flatnonzero(held_out.judged[start:stop])
-        if len(indices) >= MIN_JUDGED:
-            coverage, _, acceptable = _judge(held_out, indices, correlation_m)
-            segments.append(SegmentConsistency(start, stop, tuple(coverage.tolist()), acceptable))
-    return tuple(segments)
+def _segment_bounds(path_m: Array) -> NDArray[np.int64]:
+    """(s + 1,) of stretches of about ten metres."""
+    stretch = np.floor(path_m / SEGMENT_M)
+    return np.concatenate([[0], np.flatnonzero(np.diff(stretch)) + 1, [len(path_m)]])
 
 
-def _judge(held_out: HeldOut, indices: NDArray[np.int64], correlation_m: float) -> tuple[Array, Array, bool]:
-    """Coverage (c,) of the samples at `indices`, the probability (c,) of one as low if calibrated, and the verdict."""
-    standardised = held_out.error_uT[indices] / held_out.sd_uT[indices]
-    coverage = np.mean(np.abs(standardised) <= 2.0, axis=0)
-    walked_m = held_out.path_m[indices[-1]] - held_out.path_m[indices[0]]
-    independent = len(indices)
+def _judge(runs: Tally, correlation_m: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Of runs of samples, coverage (r, c), the probability (r, c) of one as low if calibrated, and verdicts (r,)."""
+    count = runs.samples[:, None]
+    coverage, mean_square = runs.within / count, runs.squared / count
+    independent = count
     if correlation_m > 0.0:
-        independent = min(independent, 1.0 + walked_m / (2.0 * correlation_m))
+        independent = np.minimum(count, 1.0 + np.diff(runs.path_m) / (2.0 * correlation_m))
     misses = (1.0 - coverage) * independent
     p_values = betainc(np.maximum(misses, 1e-9), independent - misses + 1.0, 1.0 - NOMINAL_COVERAGE)
     p_values = np.where(misses > 0.0, p_values, 1.0)
-    mean_square = np.mean(np.square(standardised), axis=0)
     by_chance = (p_values >= CHANCE) & (chdtrc(independent, independent * mean_square) >= CHANCE)
-    return coverage, p_values, bool(np.all((coverage >= SEED_COVERAGE) | by_chance))
+    return (
+        coverage,
+        np.asarray(p_values, np.float64),
+        np.asarray(np.all((coverage >= SEED_COVERAGE) | by_chance, axis=1)),
+    )

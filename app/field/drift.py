@@ -13,7 +13,6 @@ Both sides are in the map the others are judged by, so errors of n surveys diffe
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from scipy.special import log_ndtr
 from app.field.leave_one_out import HeldOut
 from app.field.observations import STRETCH_M, Walk
 from app.field.spec import OutOfDateRegion
+from app.field.tally import means_of_places
 from app.geometry import Array
 
 __all__ = ["BLOCK_M", "FAMILY_CHANCE", "out_of_date_regions"]
@@ -63,12 +63,15 @@ class _Table(NamedTuple):
         return _Table(self.block[rows], self.rank[rows], self.error_uT[rows], self.sd_uT[rows], self.single_sd_uT[rows])
 
 
-class _Verdict(NamedTuple):
-    """The clearest split of one block."""
+class _Verdicts(NamedTuple):
+    """The clearest split of every block; of one, (c,) and a number."""
 
-    log_p: Array  # (c,) by chance in this block, all splits and components counted
-    change_uT: Array  # (c,)
-    first_recent: int  # rank
+    log_p: Array  # (b, c) by chance in this block, all splits and components counted; 0 where there is none
+    change_uT: Array  # (b, c)
+    first_recent: NDArray[np.int64]  # (b,) rank
+
+    def at(self, block: np.intp) -> "_Verdicts":
+        return _Verdicts(*(each[block] for each in self))
 
 
 def out_of_date_regions(
@@ -86,31 +89,37 @@ def out_of_date_regions(
     table = _table(walks, held_out, order, correlation_m)
     if table is None:
         return ()
-    blocks, first = np.unique(table.block, axis=0, return_index=True)
+    blocks, first = _runs(table.block)
     bounds = np.append(first, len(table.rank))
-    verdicts = [_judge(table.at(slice(a, b))) for a, b in pairwise(bounds.tolist())]
-    tested = sum(verdict is not None for verdict in verdicts)
+    verdicts = _judge(table, bounds)
+    tested = int(np.count_nonzero(np.diff(bounds) > FEWEST_OLDER))
     if not tested:
         return ()
     low = blocks.min(axis=0)
+    clearest = verdicts.log_p.min(axis=1)
     log_p = np.zeros(blocks.max(axis=0) - low + 1)
-    for (row, column), verdict in zip(blocks - low, verdicts, strict=True):
-        log_p[row, column] = 0.0 if verdict is None else verdict.log_p.min()
+    log_p[tuple((blocks - low).T)] = clearest
     regions, count = label(log_p <= np.log(NEIGHBOUR_CHANCE), structure=np.ones((3, 3)))
     found = []
     region_of_block = regions[tuple((blocks - low).T)]
     for region in range(1, count + 1):
         inside = np.flatnonzero(region_of_block == region)
-        best = min((v for k in inside if (v := verdicts[k])), key=lambda verdict: float(verdict.log_p.min()))
+        best = verdicts.at(inside[np.argmin(clearest[inside])])
         best = best._replace(log_p=best.log_p + np.log(tested))
         if best.log_p.min() <= np.log(FAMILY_CHANCE):
-            here = table.rank[np.isin(np.searchsorted(bounds, np.arange(len(table.rank)), side="right") - 1, inside)]
+            here = np.concatenate([table.rank[bounds[block] : bounds[block + 1]] for block in inside])
             found.append(_region(blocks[inside], best, np.unique(here), order, names))
     return tuple(sorted(found, key=lambda region: region.p_value))
 
 
+def _runs(block: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """The different ones of ordered blocks (r, 2), and where each begins."""
+    first = np.append(0, np.flatnonzero(np.any(block[1:] != block[:-1], axis=1)) + 1)
+    return block[first], first
+
+
 def _region(
-    blocks: NDArray[np.int64], best: _Verdict, ranks: NDArray[np.int64], order: Sequence[str], names: tuple[str, ...]
+    blocks: NDArray[np.int64], best: _Verdicts, ranks: NDArray[np.int64], order: Sequence[str], names: tuple[str, ...]
 ) -> OutOfDateRegion:
     (y0, x0), (y1, x1) = blocks.min(axis=0) * STEP_M, blocks.max(axis=0) * STEP_M + BLOCK_M
     return OutOfDateRegion(
@@ -123,24 +132,36 @@ def _region(
     )
 
 
-def _judge(rows: _Table) -> _Verdict | None:
-    """Every split of one block's surveys into older and recent; None when there are too few to split."""
-    n = len(rows.rank)
-    if n <= FEWEST_OLDER:
-        return None
-    weight = 1.0 / np.maximum(np.square(rows.sd_uT), LEAST_VARIANCE_UT2)
-    moments = np.cumsum(np.stack([weight, weight * rows.error_uT, weight * rows.error_uT**2]), axis=1)
-    older = moments[:, FEWEST_OLDER - 1 : -1]  # (3, splits, c)
-    recent = moments[:, -1:] - older
+def _judge(table: _Table, bounds: NDArray[np.int64]) -> _Verdicts:
+    """Every split of each block's surveys into older and recent; blocks of as many surveys are judged together."""
+    count = np.diff(bounds)
+    log_p, change_uT = np.zeros((2, len(count), table.error_uT.shape[1]))
+    first_recent = np.zeros(len(count), dtype=np.int64)
+    for n in np.unique(count[count > FEWEST_OLDER]).tolist():
+        here = np.flatnonzero(count == n)
+        rows = bounds[here, None] + np.arange(n)
+        log_p[here], change_uT[here], split = _clearest(*(each[rows] for each in table[2:]))
+        first_recent[here] = table.rank[bounds[here] + FEWEST_OLDER + split]
+    return _Verdicts(log_p, change_uT, first_recent)
+
+
+def _clearest(error_uT: Array, sd_uT: Array, single_sd_uT: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Of blocks (b, n, c) of n surveys in order of time: log p and change (b, c) of the clearest split, and which."""
+    n = error_uT.shape[1]
+    weight = 1.0 / np.maximum(np.square(sd_uT), LEAST_VARIANCE_UT2)
+    moments = np.cumsum(np.stack([weight, weight * error_uT, weight * error_uT**2]), axis=2)
+    older = moments[:, :, FEWEST_OLDER - 1 : -1]  # (3, b, splits, c)
+    recent = moments[:, :, -1:] - older
     change_uT = recent[1] / recent[0] - older[1] / older[0]
     scatter = (older[2] - older[1] ** 2 / older[0] + recent[2] - recent[1] ** 2 / recent[0]) / (n - 2)
-    sd_uT = np.sqrt(np.maximum(scatter, 1.0) * (1.0 / older[0] + 1.0 / recent[0]))
+    split_sd_uT = np.sqrt(np.maximum(scatter, 1.0) * (1.0 / older[0] + 1.0 / recent[0]))
     change_uT *= (n - 1) / n
-    log_p = log_ndtr(-np.abs(change_uT) / sd_uT) + np.log(2.0 * change_uT.size)
-    matters = np.abs(change_uT) >= LEAST_CHANGE_SD * np.median(rows.single_sd_uT, axis=0)
+    log_p = log_ndtr(-np.abs(change_uT) / split_sd_uT) + np.log(2.0 * change_uT[0].size)
+    matters = np.abs(change_uT) >= LEAST_CHANGE_SD * np.median(single_sd_uT, axis=1, keepdims=True)
     log_p = np.where(matters, np.minimum(log_p, 0.0), 0.0)
-    best = int(np.argmin(log_p.min(axis=1)))
-    return _Verdict(log_p[best], change_uT[best], int(rows.rank[FEWEST_OLDER + best]))
+    split = np.argmin(log_p.min(axis=2), axis=1)
+    chosen = np.arange(len(split)), split
+    return log_p[chosen], change_uT[chosen], split
 
 
 def _table(
@@ -168,12 +189,11 @@ def _table(
 
 def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Table | None:
     """What one survey says of the blocks it walked, its offset taken out; None when they are too few."""
-    judged = np.flatnonzero(held_out.judged)
-    stretches, place = np.unique(walk.stretch_of_sample[judged], return_inverse=True)
+    each_uT, judged = means_of_places(held_out.error_uT, walk.stretch_of_sample, held_out.judged, len(walk))
+    each_uT2, _ = means_of_places(np.square(held_out.sd_uT), walk.stretch_of_sample, held_out.judged, len(walk))
+    stretches = np.flatnonzero(judged)
     if not len(stretches):
         return None
-    error_uT = np.repeat(_means(place, held_out.error_uT[judged]), len(OVERLAP), axis=0)
-    variance_uT2 = np.repeat(_means(place, np.square(held_out.sd_uT[judged])), len(OVERLAP), axis=0)
     corner = np.floor(walk.position_m[stretches, 1::-1] / STEP_M).astype(np.int64)
     cell = (corner[:, None] - OVERLAP).reshape(-1, 2)
     low, wide = cell.min(axis=0), int(np.ptp(cell[:, 1])) + 1
@@ -182,14 +202,12 @@ def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Tab
     heard = count >= FEWEST_STRETCHES
     if np.count_nonzero(heard) < FEWEST_BLOCKS:
         return None
-    error_uT, single_sd_uT = _means(place, error_uT)[heard], np.sqrt(_means(place, variance_uT2))[heard]
+    among, everyone = np.repeat(stretches, len(OVERLAP)), np.ones(len(place), dtype=np.bool_)
+    error_uT, variance_uT2 = (
+        means_of_places(each[among], place, everyone, len(key))[0][heard] for each in (each_uT, each_uT2)
+    )
+    single_sd_uT = np.sqrt(variance_uT2)
     independent = np.maximum(1.0, STRETCH_M * count[heard] / max(2.0 * correlation_m, STRETCH_M))
     offset_uT = np.median(error_uT, axis=0)
     ranks = np.full(len(error_uT), rank)
     return _Table(block[heard], ranks, error_uT - offset_uT, single_sd_uT / np.sqrt(independent)[:, None], single_sd_uT)
-
-
-def _means(place: NDArray[np.intp], values: Array) -> Array:
-    """Mean of values (n, c) over each group: (groups, c)."""
-    sums = np.stack([np.bincount(place, column) for column in values.T], axis=1)
-    return np.asarray(sums / np.bincount(place)[:, None])

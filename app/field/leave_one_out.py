@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from app.field.blending import add_at_points
 from app.field.observations import Walk, walk_bounds
 from app.field.spec import Score
+from app.field.tally import Tally, means_of_places, standardised, tally
 from app.field.tile_fit import HeldOutPart
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
@@ -41,13 +43,12 @@ class HeldOut:
     @property
     def standardised(self) -> Array:
         """(J, c) errors of the judged samples in predictive sds."""
-        return self.error_uT[self.judged] / self.sd_uT[self.judged]
+        return np.asarray(standardised(self.error_uT, self.sd_uT, self.judged))
 
-    @property
-    def nlpd(self) -> float:
-        """Mean negative log predictive density of the judged samples, per sample and component."""
-        log_sd = np.log(self.sd_uT[self.judged])
-        return float(np.mean(0.5 * np.log(2 * np.pi) + log_sd + 0.5 * np.square(self.standardised)))
+    def tally(self, bounds: NDArray[np.int64] | None = None) -> Tally:
+        """Over the runs of samples between bounds (r + 1,), or over all."""
+        runs = np.array([0, len(self.judged)]) if bounds is None else bounds
+        return tally(self.error_uT, self.sd_uT, self.judged, self.path_m, runs)
 
 
 class HeldOutPrediction:
@@ -84,24 +85,36 @@ def score(held_out: Mapping[str, HeldOut], measured_uT: Mapping[str, Array]) -> 
 
     measured_uT: survey id -> (N, c) the samples' features, of which the norm is taken (Kuevor B12, B13).
     """
-    judged = {name: h for name, h in held_out.items() if h.judged.any()}
-    if not judged:
+    tallies = [h.tally() for h in held_out.values()]
+    total = Tally(*(np.concatenate(each) for each in zip(*tallies, strict=True)))
+    if not total.samples.any():
         return None
-    error_uT = np.concatenate([h.error_uT[h.judged] for h in judged.values()])
-    measured = np.concatenate([measured_uT[name][h.judged] for name, h in judged.items()])
-    standardised = np.concatenate([h.standardised for h in judged.values()])
-    counts = np.array([np.count_nonzero(h.judged) for h in judged.values()])
-    mean_square_uT2 = np.mean(np.square(error_uT), axis=0)
-    norm_error_uT = np.linalg.norm(measured, axis=1) - np.linalg.norm(measured - error_uT, axis=1)
+    total = total.whole()
+    samples = int(total.samples[0])
+    of_norm = sum(_squared_norm_error(measured_uT[name], h.error_uT, h.judged) for name, h in held_out.items())
     return Score(
-        rmse_ut=tuple(np.sqrt(mean_square_uT2).tolist()),
-        coverage_2sigma=tuple(np.mean(np.abs(standardised) <= 2.0, axis=0).tolist()),
-        nlpd=float(counts @ [h.nlpd for h in judged.values()] / counts.sum()),
-        held_out_samples=len(error_uT),
-        rmse_vec_ut=float(np.sqrt(mean_square_uT2.sum())),
-        rmse_of_norm_ut=float(np.sqrt(np.mean(np.square(norm_error_uT)))),
-        sharpness_ut=tuple(np.concatenate([h.sd_uT[h.judged] for h in judged.values()]).mean(axis=0).tolist()),
+        rmse_ut=tuple(np.sqrt(total.squared_uT2[0] / samples).tolist()),
+        coverage_2sigma=tuple((total.within[0] / samples).tolist()),
+        nlpd=total.nlpd,
+        held_out_samples=samples,
+        rmse_vec_ut=float(np.sqrt(total.squared_uT2.sum() / samples)),
+        rmse_of_norm_ut=float(np.sqrt(of_norm / samples)),
+        sharpness_ut=tuple((total.sd_uT[0] / samples).tolist()),
     )
+
+
+@njit(cache=True)
+def _squared_norm_error(measured_uT: Array, error_uT: Array, judged: NDArray[np.bool_]) -> float:
+    """Sum over the judged samples of the squared difference of the norms measured and predicted."""
+    total = 0.0
+    for i in range(len(judged)):
+        if judged[i]:
+            measured, predicted = 0.0, 0.0
+            for c in range(error_uT.shape[1]):
+                measured += measured_uT[i, c] ** 2
+                predicted += (measured_uT[i, c] - error_uT[i, c]) ** 2
+            total += (np.sqrt(measured) - np.sqrt(predicted)) ** 2
+    return total
 
 
 def error_correlation_m(held_out: Mapping[str, HeldOut]) -> float:
@@ -116,21 +129,34 @@ def error_correlation_m(held_out: Mapping[str, HeldOut]) -> float:
 def _integral_length(held_out: HeldOut) -> float | None:
     """Integral of one survey's autocorrelation up to its first zero; None when too little of it is judged."""
     path_m = held_out.path_m[held_out.judged]
-    cell = np.floor(path_m / LAG_M).astype(np.int64)
-    cells, first = np.unique(cell, return_index=True)
-    if len(cells) < 8:
+    if not len(path_m):
         return None
-    z = np.add.reduceat(np.clip(held_out.standardised, -5.0, 5.0), first, axis=0)
-    z /= np.diff(np.append(first, len(cell)))[:, None]
-    padded = np.full((cells[-1] - cells[0] + 1, z.shape[1]), np.nan)
-    padded[cells - cells[0]] = z
-    power = np.nanmean(np.square(padded))
+    cell = np.floor(path_m / LAG_M).astype(np.int64)
+    cell -= cell[0]
+    cells = int(cell[-1]) + 1
+    clipped = np.clip(held_out.standardised, -5.0, 5.0)
+    z, count = means_of_places(clipped, cell, np.ones(len(cell), dtype=np.bool_), cells)
+    known = count > 0
+    if np.count_nonzero(known) < 8:
+        return None
+    power = float(np.mean(np.square(z[known])))
     if power == 0.0:
         return 0.0
+    return float(_correlated_lags(z, known, power, min(int(MAX_LAG_M / LAG_M), cells - 1))) * LAG_M
+
+
+@njit(cache=True)
+def _correlated_lags(z: Array, known: NDArray[np.bool_], power: float, most: int) -> float:
+    """Half of one, and the sum of the autocorrelations of cells (n, c) at lags below `most`, up to their first zero."""
     total = 0.5
-    for lag in range(1, min(int(MAX_LAG_M / LAG_M), len(padded) - 1)):
-        products = padded[lag:] * padded[:-lag]
-        if np.isnan(products).all() or (rho := float(np.nanmean(products) / power)) <= 0.0:
+    for lag in range(1, most):
+        product, count = 0.0, 0
+        for i in range(lag, len(z)):
+            if known[i] and known[i - lag]:
+                count += z.shape[1]
+                for c in range(z.shape[1]):
+                    product += z[i, c] * z[i - lag, c]
+        if count == 0 or product <= 0.0:
             break
-        total += rho
-    return total * LAG_M
+        total += product / count / power
+    return total
