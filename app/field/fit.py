@@ -23,6 +23,7 @@ from app.field.observations import Walk, observe
 from app.field.refinement import Untouched, refine
 from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import Engine, FittedMap, MapSpec, Progress
+from app.field.tally import held_out_errors
 from app.field.tile_fit import FitState
 from app.geometry import Array
 
@@ -127,15 +128,19 @@ def _held_out(
     untouched: of surveys whose labels were corrected by the others, which agree too well.
     """
     near = near_other_walks(walks, volume=len(estimate.gradient_uT_per_m) == 3)
-    error_uT, latent_uT2, needed_uT2 = {}, {}, {}
+    error_uT, needed_uT2, latent_uT2, place = {}, {}, {}, {}
     for walk in walks:
-        name, stretch = walk.survey_id, walk.stretch_of_sample
-        error_uT[name] = walk.sample_field_uT - (estimate.ambient_uT + estimate.held_out_mean_uT[name])[stretch]
-        latent_uT2[name] = (estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT))[stretch]
+        name = walk.survey_id
         if name in untouched:
-            error_uT[name] = walk.sample_field_uT - untouched[name].mean_uT
-            latent_uT2[name] = untouched[name].variance_uT2
-        needed_uT2[name] = (np.square(error_uT[name]) / 4.0 - latent_uT2[name])[near[name]]
+            predicted_uT, latent_uT2[name] = untouched[name]
+            place[name] = np.arange(len(predicted_uT))
+        else:
+            predicted_uT = estimate.ambient_uT + estimate.held_out_mean_uT[name]
+            latent_uT2[name] = estimate.held_out_variance_ratio[name] * np.square(estimate.prior_sd_uT)
+            place[name] = walk.stretch_of_sample
+        error_uT[name], needed_uT2[name] = held_out_errors(
+            walk.sample_field_uT, predicted_uT, latent_uT2[name], place[name], near[name]
+        )
     scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
     believed_sd_uT = np.sqrt(np.square(estimate.error_sd_uT) + scatter_uT2)
     nothing = np.zeros((0, len(believed_sd_uT)))
@@ -143,7 +148,7 @@ def _held_out(
     held_out = {
         walk.survey_id: HeldOut(
             error_uT=error_uT[walk.survey_id],
-            sd_uT=np.sqrt(latent_uT2[walk.survey_id] + np.square(shown_sd_uT[walk.survey_id])),
+            sd_uT=np.sqrt(latent_uT2[walk.survey_id] + np.square(shown_sd_uT[walk.survey_id]))[place[walk.survey_id]],
             judged=near[walk.survey_id],
             path_m=walk.path_m[walk.stretch_of_sample],
         )

@@ -21,10 +21,9 @@ def cell_members(points_m: Array, pitch_m: float, reach: float) -> tuple[Indices
     """
     if not len(points_m):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64), [0]
-    scaled = points_m / pitch_m
-    home = np.floor(scaled)
-    first = home.min(axis=0).astype(np.int64) - 1
-    columns, rows = (home.max(axis=0).astype(np.int64) + 2 - first).tolist()
+    scaled = np.ascontiguousarray(points_m.T) / pitch_m  # (2, n): extremes along rows are quick
+    first = np.floor(scaled.min(axis=1)).astype(np.int64) - 1
+    columns, rows = (np.floor(scaled.max(axis=1)).astype(np.int64) + 2 - first).tolist()
     key, index = _near_cells(scaled, first, rows, reach)
     if columns * rows <= SPARSE * len(points_m):
         order, cells, bounds = _counted(key, columns * rows)
@@ -38,12 +37,12 @@ def cell_members(points_m: Array, pitch_m: float, reach: float) -> tuple[Indices
 @njit(cache=True)
 def _near_cells(scaled: Array, first: Indices, rows: int, reach: float) -> tuple[Indices, Indices]:
     """Key of every cell near a point, and the point, in order of points."""
-    key = np.empty(9 * len(scaled), dtype=np.int64)
-    index = np.empty(9 * len(scaled), dtype=np.int64)
+    key = np.empty(9 * scaled.shape[1], dtype=np.int64)
+    index = np.empty(9 * scaled.shape[1], dtype=np.int64)
     count = 0
-    for i in range(len(scaled)):
-        column, row = np.floor(scaled[i, 0]), np.floor(scaled[i, 1])
-        x, y = scaled[i, 0] - column, scaled[i, 1] - row
+    for i in range(scaled.shape[1]):
+        column, row = np.floor(scaled[0, i]), np.floor(scaled[1, i])
+        x, y = scaled[0, i] - column, scaled[1, i] - row
         for right in range(-1, 2):
             if (right < 0 and x > reach) or (right > 0 and x < 1.0 - reach):
                 continue

@@ -68,18 +68,40 @@ def walk_bounds(walks: Sequence[Walk]) -> list[int]:
 
 def _average(survey_id: str, samples: Samples, components: Components, stretch_m: float) -> Walk:
     field_uT, position = samples.features(components), samples.p_building_m
-    if not (np.isfinite(field_uT).all() and np.isfinite(position).all()):
-        raise InvalidInput(f"survey {survey_id} has samples that are not finite numbers: remove them and upload again")
     starts = _stretch_starts(position, stretch_m)
-    counts = np.diff(np.append(starts, len(samples)))
-    position_m = np.add.reduceat(position, starts, axis=0) / counts[:, None]
-    mean = np.add.reduceat(field_uT, starts, axis=0) / counts[:, None]
-    deviation = field_uT - np.repeat(mean, counts, axis=0)
-    scatter = np.mean(np.square(deviation), axis=0)
+    position_m, mean_uT, scatter_uT2, stretch_of_sample = _means(position, field_uT, np.append(starts, len(samples)))
+    if not (np.isfinite(mean_uT).all() and np.isfinite(position_m).all()):
+        raise InvalidInput(f"survey {survey_id} has samples that are not finite numbers: remove them and upload again")
     steps = np.linalg.norm(np.diff(position_m[:, :2], axis=0), axis=1)
     path_m = np.concatenate([[0.0], np.cumsum(steps)])
-    stretch_of_sample = np.repeat(np.arange(len(starts)), counts)
-    return Walk(survey_id, position_m, mean, path_m, scatter, field_uT, stretch_of_sample)
+    return Walk(survey_id, position_m, mean_uT, path_m, scatter_uT2, field_uT, stretch_of_sample)
+
+
+@njit(cache=True)
+def _means(
+    position_m: Array, field_uT: Array, bounds: NDArray[np.int64]
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Position (n, 3) and field (n, c) averaged between bounds (n + 1,), mean variance (c,) about that, and the stretch
+
+    (N,) of every sample.
+    """
+    stretches, components = len(bounds) - 1, field_uT.shape[1]
+    place, mean = np.zeros((stretches, 3)), np.zeros((stretches, components))
+    scatter, stretch_of_sample = np.zeros(components), np.empty(len(field_uT), dtype=np.int64)
+    for stretch in range(stretches):
+        first, last = bounds[stretch], bounds[stretch + 1]
+        for i in range(first, last):
+            stretch_of_sample[i] = stretch
+            for axis in range(3):
+                place[stretch, axis] += position_m[i, axis]
+            for c in range(components):
+                mean[stretch, c] += field_uT[i, c]
+        place[stretch] /= last - first
+        mean[stretch] /= last - first
+        for i in range(first, last):
+            for c in range(components):
+                scatter[c] += (field_uT[i, c] - mean[stretch, c]) ** 2
+    return place, mean, scatter / len(field_uT), stretch_of_sample
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["Tally", "means_of_places", "standardised", "tally"]
+__all__ = ["Tally", "held_out_errors", "means_of_places", "standardised", "tally"]
 
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
@@ -80,6 +80,26 @@ def _tally(
                     product[c] = 1.0
         log_sd[run] += np.log(product)
     return count, ends_m, within, squared_uT2, squared, total_sd, log_sd
+
+
+@njit(cache=True)
+def held_out_errors(
+    field_uT: Array, predicted_uT: Array, latent_uT2: Array, place: Indices, judged: Bools
+) -> tuple[Array, Array]:
+    """Error (N, c) of samples whose prediction and its variance (n, c) stand at `place` (N,); and, of the judged ones,
+
+    the noise variance (j, c) with which each would lie at two predictive sds.
+    """
+    error = np.empty(field_uT.shape)
+    needed = np.empty((np.count_nonzero(judged), field_uT.shape[1]))
+    row = 0
+    for i in range(len(field_uT)):
+        for c in range(field_uT.shape[1]):
+            error[i, c] = field_uT[i, c] - predicted_uT[place[i], c]
+            if judged[i]:
+                needed[row, c] = error[i, c] ** 2 / 4.0 - latent_uT2[place[i], c]
+        row += judged[i]
+    return error, needed
 
 
 @njit(cache=True)
