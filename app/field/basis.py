@@ -6,7 +6,7 @@ the field to the ambient value. Of all products those within a disc of frequenci
 isotropic field. Products of cosines are sums of cosines, which `app.field.moments` makes use of.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -49,7 +49,7 @@ class CosineBasis:
         return 1
 
     def at_origin(self) -> "CosineBasis":
-        return replace(self, corner_m=(0.0, 0.0))
+        return CosineBasis((0.0, 0.0), self.side_m, self.functions_per_axis)
 
     def rows(self, points_m: Array) -> Array:
         """(1, n, m) values of all functions at points (n, 2) or (n, 3), whose height is not looked at."""

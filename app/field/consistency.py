@@ -69,31 +69,20 @@ def check_consistency(held_out: HeldOut, names: tuple[str, ...], correlation_m: 
         reason = f"{judged} of its samples are near another survey, {MIN_JUDGED} are needed: survey the area again"
         return ConsistencyReport("unjudged", None, judged, None, reason=reason)
     whole, heard = runs.whole(), np.flatnonzero(runs.samples >= MIN_JUDGED)
-    coverage, p_values, acceptable = _judge(whole, correlation_m)
-    rmse_uT, mean_sd_uT = np.sqrt(whole.squared_uT2[0] / judged), whole.sd_uT[0] / judged
-    components = tuple(
-        ComponentConsistency(
-            component=name,
-            coverage_2sigma=float(coverage[0, c]),
-            seed_2sigma_96=bool(coverage[0, c] >= SEED_COVERAGE),
-            rmse_ut=float(rmse_uT[c]),
-            mean_sd_ut=float(mean_sd_uT[c]),
-            p_value=float(p_values[0, c]),
-        )
-        for c, name in enumerate(names)
-    )
-    of_segments, _, accepted = _judge(runs.at(heard), correlation_m)
-    segments = tuple(
-        SegmentConsistency(int(bounds[run]), int(bounds[run + 1]), tuple(covered), good)
-        for run, covered, good in zip(heard, of_segments.tolist(), accepted.tolist(), strict=True)
-    )
+    both = Tally(*(np.concatenate(each) for each in zip(whole, runs.at(heard), strict=True)))
+    coverage, p_values, verdicts = (each.tolist() for each in _judge(both, correlation_m))
+    rmse_uT, mean_sd_uT = np.sqrt(whole.squared_uT2[0] / judged).tolist(), (whole.sd_uT[0] / judged).tolist()
+    passed = [covered >= SEED_COVERAGE for covered in coverage[0]]
+    columns = zip(names, coverage[0], passed, rmse_uT, mean_sd_uT, p_values[0], strict=True)
+    starts, stops = bounds[heard].tolist(), bounds[heard + 1].tolist()
+    segments = zip(starts, stops, map(tuple, coverage[1:]), verdicts[1:], strict=True)
     return ConsistencyReport(
-        status="consistent" if acceptable[0] and accepted.all() else "inconsistent",
-        seed_2sigma_96=all(component.seed_2sigma_96 for component in components),
+        status="consistent" if all(verdicts) else "inconsistent",
+        seed_2sigma_96=all(passed),
         judged_samples=judged,
         nlpd=whole.nlpd,
-        components=components,
-        segments=segments,
+        components=tuple(ComponentConsistency(*column) for column in columns),
+        segments=tuple(SegmentConsistency(*segment) for segment in segments),
         change_point=find_change(held_out, names, correlation_m),
     )
 

@@ -197,17 +197,19 @@ def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Tab
     corner = np.floor(walk.position_m[stretches, 1::-1] / STEP_M).astype(np.int64)
     cell = (corner[:, None] - OVERLAP).reshape(-1, 2)
     low, wide = cell.min(axis=0), int(np.ptp(cell[:, 1])) + 1
-    key, place, count = np.unique((cell - low) @ [wide, 1], return_inverse=True, return_counts=True)
-    block = low + np.stack(np.divmod(key, wide), axis=1)
+    key = (cell - low) @ [wide, 1]
+    order = np.argsort(key, kind="stable")
+    first = np.append(0, np.flatnonzero(np.diff(key[order])) + 1)
+    count = np.diff(np.append(first, len(key)))
     heard = count >= FEWEST_STRETCHES
     if np.count_nonzero(heard) < FEWEST_BLOCKS:
         return None
-    among, everyone = np.repeat(stretches, len(OVERLAP)), np.ones(len(place), dtype=np.bool_)
+    block, among = cell[order[first[heard]]], stretches[order // len(OVERLAP)]
     error_uT, variance_uT2 = (
-        means_of_places(each[among], place, everyone, len(key))[0][heard] for each in (each_uT, each_uT2)
+        (np.add.reduceat(each[among], first) / count[:, None])[heard] for each in (each_uT, each_uT2)
     )
     single_sd_uT = np.sqrt(variance_uT2)
     independent = np.maximum(1.0, STRETCH_M * count[heard] / max(2.0 * correlation_m, STRETCH_M))
     offset_uT = np.median(error_uT, axis=0)
     ranks = np.full(len(error_uT), rank)
-    return _Table(block[heard], ranks, error_uT - offset_uT, single_sd_uT / np.sqrt(independent)[:, None], single_sd_uT)
+    return _Table(block, ranks, error_uT - offset_uT, single_sd_uT / np.sqrt(independent)[:, None], single_sd_uT)

@@ -14,12 +14,15 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from app.field.basis import CosineBasis
 from app.field.hyperparameters import Basis, Hyperparameters
-from app.field.moments import VarianceSeries, cosines, scaled_functions
+from app.field.moments import VarianceSeries, cosines, scaled_functions, scaled_functions_on_lattice
 from app.field.slab import SlabBasis
 from app.field.statistics import Evidence
 from app.geometry import Array
 
 __all__ = ["Patch", "PlanePosterior", "SlabPosterior", "posterior", "predict"]
+
+FEW_POINTS = 1.0
+"""Per function: of more, their variances cost less by way of the covariance of the weights."""
 
 
 class Patch(NamedTuple):
@@ -45,7 +48,7 @@ class PlanePosterior:
 
     basis: CosineBasis
     weights_uT: Array
-    variance: VarianceSeries
+    variance: "VarianceSeries | _Solved"
     detail_ratio: float
 
     def at(self, points_m: Array) -> tuple[Array, Array]:
@@ -66,6 +69,28 @@ class PlanePosterior:
             np.minimum(variance, 1.0)[None, None],
         )
         return Patch(*(np.repeat(values, len(heights_m), axis=-3) for values in one[:3]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """The variance of a plane's functions from the factor (m, m) of their scaled precision, point by point."""
+
+    basis: CosineBasis
+    factor: Array
+    root: Array
+
+    def at(self, points_m: Array) -> Array:
+        """(n,) variance at points (n, 2)."""
+        return self._of(scaled_functions(self.basis, points_m, self.root))
+
+    def on_lattice(self, cosines_x: Array, cosines_y: Array) -> Array:
+        """(ny, nx) variance at the crossings of columns and rows with these `cosines` (nx, 2k - 1), (ny, 2k - 1)."""
+        functions = scaled_functions_on_lattice(self.basis, cosines_x, cosines_y, self.root)
+        return self._of(functions).reshape(len(cosines_y), len(cosines_x))
+
+    def _of(self, functions: Array) -> Array:
+        half = dtrsm(1.0, self.factor, functions, lower=1, overwrite_b=1)
+        return np.asarray(np.einsum("mn,mn->n", half, half))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,14 +129,21 @@ class SlabPosterior:
         return np.asarray(np.minimum(np.einsum("mn,mn->n", half, half).reshape(r, n) + self.detail_ratio, 1.0))
 
 
-def posterior(basis: Basis, evidence: Evidence, hyper: Hyperparameters) -> PlanePosterior | SlabPosterior:
-    """The posterior of one tile given the sum of its surveys' evidence."""
+def posterior(
+    basis: Basis, evidence: Evidence, hyper: Hyperparameters, points: int | None = None
+) -> PlanePosterior | SlabPosterior:
+    """The posterior of one tile given the sum of its surveys' evidence.
+
+    points: at about how many it will be asked for, if that is known: for few, a series of the variance does not pay.
+    """
     root, factor = _factor(basis, evidence, hyper)
     scaled, info = dpotrs(factor, root[:, None] * evidence.target, lower=1)
     assert info == 0, info
     weights_uT, detail_ratio = root[:, None] * scaled, hyper.detail_ratio(basis)
     if isinstance(basis, SlabBasis):
         return SlabPosterior(basis, weights_uT, factor, root, detail_ratio)
+    if points is not None and points <= FEW_POINTS * basis.size:
+        return PlanePosterior(basis, weights_uT, _Solved(basis, factor, root), detail_ratio)
     covariance, info = dpotri(factor, lower=1, overwrite_c=1)
     assert info == 0, info
     return PlanePosterior(basis, weights_uT, VarianceSeries.of(basis, covariance, root), detail_ratio)

@@ -8,6 +8,7 @@ A field that is minus the gradient of a potential has the smoothness of its name
 (Matern nu + 1); the potential's variance is such that every component of the field has unit variance.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -99,6 +100,7 @@ def log_spectral_slope(
     return d - 2.0 * (nu + dimensions / 2) * z / (1.0 + z)
 
 
+@lru_cache(maxsize=64)
 def variance_beyond(
     kernel: BaseKernel, cutoff_rad_per_m: float, length_m: float, dimensions: int = 2, potential: bool = False
 ) -> float:

@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 from app.field.basis import CosineBasis
 from app.geometry import Array
 
-__all__ = ["VarianceSeries", "cosines", "gram_of_moments", "moments_of", "scaled_functions"]
+__all__ = [
+    "VarianceSeries",
+    "cosines",
+    "gram_of_moments",
+    "moments_of",
+    "scaled_functions",
+    "scaled_functions_on_lattice",
+]
 
 
 def cosines(basis: CosineBasis, axis: int, coordinate_m: Array) -> Array:
@@ -35,6 +42,11 @@ def scaled_functions(basis: CosineBasis, points_m: Array, scale: Array) -> Array
     """`diag(scale) Phi^T` (m, n) at points (n, 2), scale (m,), in Fortran order."""
     x, y = _cosine(basis, 0, points_m[:, 0]), _cosine(basis, 1, points_m[:, 1])
     return np.asarray(_functions(x, y, basis.orders, scale * basis.norms, basis.functions_per_axis).T)
+
+
+def scaled_functions_on_lattice(basis: CosineBasis, cosines_x: Array, cosines_y: Array, scale: Array) -> Array:
+    """`scaled_functions` at the crossings of rows and columns with these `cosines`, row after row."""
+    return np.asarray(_on_lattice(cosines_x, cosines_y, basis.orders, scale * basis.norms).T)
 
 
 def moments_of(basis: CosineBasis, points_m: Array, features: Array) -> tuple[Array, Array]:
@@ -104,6 +116,17 @@ def _functions(x: Array, y: Array, orders: NDArray[np.int64], scale: Array, degr
 
 
 @njit(cache=True)
+def _on_lattice(along_x: Array, along_y: Array, orders: NDArray[np.int64], scale: Array) -> Array:
+    """(ny nx, m) scaled products of the cosines of rows (ny, k) and columns (nx, k)."""
+    values = np.empty((len(along_y) * len(along_x), len(orders)))
+    for y in range(len(along_y)):
+        for x in range(len(along_x)):
+            for j in range(len(orders)):
+                values[y * len(along_x) + x, j] = scale[j] * along_x[x, orders[j, 0]] * along_y[y, orders[j, 1]]
+    return values
+
+
+@njit(cache=True)
 def _moments(x: Array, y: Array, features: Array, k: int) -> tuple[Array, Array]:
     """M (2k - 1, 2k - 1), and the same sums with every feature as weight (k, k, c); `cos u` and `cos v` (n,)."""
     degrees, components = 2 * k - 1, features.shape[1]
@@ -125,20 +148,24 @@ def _moments(x: Array, y: Array, features: Array, k: int) -> tuple[Array, Array]
 
 @njit(cache=True)
 def _gram(moments: Array, orders: NDArray[np.int64], scale: Array) -> Array:
-    """The upper triangle in C order."""
-    m = len(orders)
+    """The upper triangle in C order; the functions of one order along x lie side by side, in order along y."""
+    m, degrees = len(orders), moments.shape[1]
     gram = np.zeros((m, m))
-    row = np.empty(moments.shape[1])
-    for i in range(m):
-        a, b = orders[i, 0], orders[i, 1]
-        last = -1
-        for j in range(i, m):
-            other_a, other_b = orders[j, 0], orders[j, 1]
-            if other_a != last:
-                last = other_a
-                for q in range(len(row)):
-                    row[q] = moments[other_a - a, q] + moments[a + other_a, q]
-            gram[i, j] = 0.25 * scale[i] * scale[j] * (row[abs(b - other_b)] + row[b + other_b])
+    first = np.searchsorted(orders[:, 0], np.arange(orders[-1, 0] + 2))
+    row, mirrored = np.empty(degrees), np.empty(2 * degrees - 1)
+    for a in range(len(first) - 1):
+        for other_a in range(a, len(first) - 1):
+            for q in range(degrees):
+                row[q] = moments[other_a - a, q] + moments[a + other_a, q]
+                mirrored[degrees - 1 + q] = mirrored[degrees - 1 - q] = row[q]
+            start, count = first[other_a], first[other_a + 1] - first[other_a]
+            for b in range(first[a + 1] - first[a]):
+                i = first[a] + b
+                factor = 0.25 * scale[i]
+                for other_b in range(b if other_a == a else 0, count):
+                    j = start + other_b
+                    both = mirrored[degrees - 1 + other_b - b] + row[b + other_b]
+                    gram[i, j] = factor * scale[j] * both
     return gram
 
 

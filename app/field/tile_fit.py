@@ -78,7 +78,7 @@ def fit_tile(
     evidence = student_evidence(tiled, tile, hyper) if robust else tiled.evidence(tile, hyper)
     total = add_evidence(evidence.values())
     x_m, y_m = (tile_cells(learned.lattice, axis, tile, resolution_m) for axis in (0, 1))
-    fitted = posterior(basis, total, hyper)
+    fitted = posterior(basis, total, hyper, len(x_m) * len(y_m))
     borders = np.zeros((2, 4, 0))
     if isinstance(fitted, SlabPosterior) and basis.potential:
         points_m = learned.lattice.borders(tile, heights_m)

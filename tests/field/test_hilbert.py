@@ -90,6 +90,11 @@ def test_predicting_a_few_points_equals_the_posterior_there(room):
         predict(basis, evidence, hyper, points), posterior(basis, evidence, hyper).at(points), strict=True
     ):
         assert np.allclose(one, other, atol=1e-9)
+    x_m, y_m = points[:5, 0], points[:6, 1]
+    few, many = (posterior(basis, evidence, hyper, asked) for asked in (30, 10_000))
+    for one, other in zip(few.patch(x_m, y_m, np.zeros(1))[:3], many.patch(x_m, y_m, np.zeros(1))[:3], strict=True):
+        assert np.allclose(one, other, atol=1e-9)
+    assert np.allclose(few.at(points)[1], many.at(points)[1], atol=1e-9)
 
 
 def test_coverage_is_honest_on_data_from_the_model():
