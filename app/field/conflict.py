@@ -86,7 +86,8 @@ def _spread(
     reach = int(REACH_M / step_m + 1e-9)
     dx, dy = np.meshgrid(*[np.arange(-reach, reach + 1)] * 2)
     disc = np.hypot(dx, dy) * step_m <= REACH_M + 1e-9
-    low, high = indices.min(axis=0) - reach, indices.max(axis=0) + reach
+    along = np.ascontiguousarray(indices.T)  # extremes along rows are quick
+    low, high = along.min(axis=1) - reach, along.max(axis=1) + reach
     wide, tall = (high - low + 1).tolist()
     near, weight, total = _around(indices - low, error, disc, tall, wide)
     (x0, y0), (x1, y1) = np.maximum(low, 0), np.minimum(high + 1, shape[::-1])

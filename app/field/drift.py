@@ -189,25 +189,23 @@ def _table(
 
 def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Table | None:
     """What one survey says of the blocks it walked, its offset taken out; None when they are too few."""
-    each_uT, judged = means_of_places(held_out.error_uT, walk.stretch_of_sample, held_out.judged, len(walk))
-    each_uT2, _ = means_of_places(np.square(held_out.sd_uT), walk.stretch_of_sample, held_out.judged, len(walk))
+    what = np.hstack([held_out.error_uT, np.square(held_out.sd_uT)])
+    each, judged = means_of_places(what, walk.stretch_of_sample, held_out.judged, len(walk))
     stretches = np.flatnonzero(judged)
     if not len(stretches):
         return None
-    corner = np.floor(walk.position_m[stretches, 1::-1] / STEP_M).astype(np.int64)
-    cell = (corner[:, None] - OVERLAP).reshape(-1, 2)
-    low, wide = cell.min(axis=0), int(np.ptp(cell[:, 1])) + 1
-    key = (cell - low) @ [wide, 1]
+    corner = np.floor(walk.position_m[stretches, 1::-1].T / STEP_M).astype(np.int64)  # (2, n): rows are quick
+    row, column = (corner[:, :, None] - OVERLAP.T[:, None]).reshape(2, -1)
+    key = row * (np.ptp(column) + 1) + column
     order = np.argsort(key, kind="stable")
     first = np.append(0, np.flatnonzero(np.diff(key[order])) + 1)
     count = np.diff(np.append(first, len(key)))
     heard = count >= FEWEST_STRETCHES
     if np.count_nonzero(heard) < FEWEST_BLOCKS:
         return None
-    block, among = cell[order[first[heard]]], stretches[order // len(OVERLAP)]
-    error_uT, variance_uT2 = (
-        (np.add.reduceat(each[among], first) / count[:, None])[heard] for each in (each_uT, each_uT2)
-    )
+    block = np.stack([row, column], axis=1)[order[first[heard]]]
+    among = each.take(stretches[order // len(OVERLAP)], axis=0)
+    error_uT, variance_uT2 = np.hsplit((np.add.reduceat(among, first) / count[:, None])[heard], 2)
     single_sd_uT = np.sqrt(variance_uT2)
     independent = np.maximum(1.0, STRETCH_M * count[heard] / max(2.0 * correlation_m, STRETCH_M))
     offset_uT = np.median(error_uT, axis=0)

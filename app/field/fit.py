@@ -146,13 +146,13 @@ def _held_out(
     nothing = np.zeros((0, len(believed_sd_uT)))
     shown_sd_uT = noise_sd_by_survey({**needed_uT2, NEW: nothing}, believed_sd_uT)
     held_out = {
-        walk.survey_id: HeldOut(
-            error_uT=error_uT[walk.survey_id],
-            sd_uT=np.sqrt(latent_uT2[walk.survey_id] + np.square(shown_sd_uT[walk.survey_id]))[place[walk.survey_id]],
-            judged=near[walk.survey_id],
-            path_m=walk.path_m[walk.stretch_of_sample],
+        name: HeldOut(
+            error_uT=error_uT[name],
+            sd_uT=np.sqrt(latent_uT2[name] + np.square(shown_sd_uT[name])).take(place[name], axis=0),
+            judged=near[name],
+            path_m=walk.path_m.take(walk.stretch_of_sample),
         )
-        for walk in walks
+        for name, walk in ((walk.survey_id, walk) for walk in walks)
     }
     return held_out, shown_sd_uT[NEW]
 

@@ -66,13 +66,12 @@ def near_observations(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[
     if not volume:
         position_m = position_m * [1.0, 1.0, 0.0]
     survey = np.repeat(np.arange(len(walks)), [len(walk) for walk in walks])
-    cell = np.floor(position_m[:, :2] / REACH_M).astype(np.int64)
-    cell -= cell.min(axis=0)
-    rows = int(cell[:, 1].max()) + 3
-    key = (cell[:, 0] + 1) * rows + cell[:, 1] + 1
+    column, row = np.floor(position_m[:, :2].T / REACH_M).astype(np.int64)
+    rows = int(np.ptp(row)) + 3
+    key = (column - column.min() + 1) * rows + row - row.min() + 1
     order = np.argsort(key, kind="stable")
     close = np.empty(len(key), dtype=np.bool_)
-    close[order] = _near_others(position_m[order], survey[order], key[order], rows, REACH_M**2)
+    close[order] = _near_others(position_m.take(order, axis=0), survey[order], key[order], rows, REACH_M**2)
     parts = np.split(close, walk_bounds(walks)[1:-1])
     return {walk.survey_id: part for walk, part in zip(walks, parts, strict=True)}
 

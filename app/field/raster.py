@@ -36,10 +36,10 @@ class GridFrame:
 
         Raises InvalidInput when that has more than twenty million cells.
         """
-        position_m = np.concatenate([walk.position_m for walk in walks])
+        across_m = [np.concatenate([walk.position_m[:, axis] for walk in walks]) for axis in (0, 1)]
         margin_m = min(length_m, MAX_MARGIN_M)
-        low = np.floor((position_m[:, :2].min(axis=0) - margin_m) / resolution_m)
-        high = np.ceil((position_m[:, :2].max(axis=0) + margin_m) / resolution_m)
+        low = np.floor((np.array([each.min() for each in across_m]) - margin_m) / resolution_m)
+        high = np.ceil((np.array([each.max() for each in across_m]) + margin_m) / resolution_m)
         cells = np.prod(high - low + 1.0) * len(heights_m)
         if cells > MAX_CELLS:
             width, depth = (high - low) * resolution_m
