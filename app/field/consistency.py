@@ -22,7 +22,7 @@ from app.field.leave_one_out import HeldOut
 from app.field.noise_calibration import NOMINAL_COVERAGE
 from app.field.ranks import ranked_without
 from app.field.spec import ComponentConsistency, ConsistencyReport, SegmentConsistency
-from app.field.tally import Tally
+from app.field.tally import Tally, count_below
 from app.geometry import Array
 
 __all__ = ["MIN_JUDGED", "check_consistency", "check_surveys"]
@@ -43,12 +43,25 @@ def check_surveys(
     held_out: Mapping[str, HeldOut], names: tuple[str, ...], correlation_m: float
 ) -> dict[str, ConsistencyReport]:
     """The report of every survey, each judged by what the errors of the others show."""
-    shown = _medians_of_others([np.abs(h.standardised) for h in held_out.values()])
-    scales = np.clip(GENEROSITY * ROBUST_SD * shown, 1e-3, 1.0)
+    scales = _scales(list(held_out.values()))
+    if scales is None:
+        return {survey_id: check_consistency(own, names, correlation_m) for survey_id, own in held_out.items()}
     return {
         survey_id: check_consistency(replace(own, sd_uT=own.sd_uT * scale), names, correlation_m)
         for (survey_id, own), scale in zip(held_out.items(), scales, strict=True)
     }
+
+
+def _scales(surveys: Sequence[HeldOut]) -> Array | None:
+    """(s, c) factors on the sds of every survey; None when all are one, which counting tells without any median."""
+    least = 1.0 / (GENEROSITY * ROBUST_SD)
+    slight = np.array([count_below(least, h.error_uT, h.sd_uT, h.judged) for h in surveys])
+    own = np.array([np.count_nonzero(h.judged) for h in surveys])
+    others = own.sum() - own
+    if np.all(slight.sum(axis=0) - slight <= (np.maximum(others, 1)[:, None] - 1) // 2):
+        return None
+    shown = _medians_of_others([np.abs(h.standardised) for h in surveys])
+    return np.asarray(np.clip(GENEROSITY * ROBUST_SD * shown, 1e-3, 1.0))
 
 
 def _medians_of_others(values: Sequence[Array]) -> Array:

@@ -189,8 +189,8 @@ def _table(
 
 def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Table | None:
     """What one survey says of the blocks it walked, its offset taken out; None when they are too few."""
-    what = np.hstack([held_out.error_uT, np.square(held_out.sd_uT)])
-    each, judged = means_of_places(what, walk.stretch_of_sample, held_out.judged, len(walk))
+    errors_uT, judged = means_of_places(held_out.error_uT, walk.stretch_of_sample, held_out.judged, len(walk))
+    variances_uT2, _ = means_of_places(np.square(held_out.sd_uT), walk.stretch_of_sample, held_out.judged, len(walk))
     stretches = np.flatnonzero(judged)
     if not len(stretches):
         return None
@@ -204,7 +204,7 @@ def _say(walk: Walk, held_out: HeldOut, rank: int, correlation_m: float) -> _Tab
     if np.count_nonzero(heard) < FEWEST_BLOCKS:
         return None
     block = np.stack([row, column], axis=1)[order[first[heard]]]
-    among = each.take(stretches[order // len(OVERLAP)], axis=0)
+    among = np.hstack([errors_uT, variances_uT2]).take(stretches[order // len(OVERLAP)], axis=0)
     error_uT, variance_uT2 = np.hsplit((np.add.reduceat(among, first) / count[:, None])[heard], 2)
     single_sd_uT = np.sqrt(variance_uT2)
     independent = np.maximum(1.0, STRETCH_M * count[heard] / max(2.0 * correlation_m, STRETCH_M))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["Tally", "held_out_errors", "means_of_places", "standardised", "tally"]
+__all__ = ["Tally", "count_below", "held_out_errors", "means_of_places", "standardised", "tally"]
 
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
@@ -100,6 +100,17 @@ def held_out_errors(
                 needed[row, c] = error[i, c] ** 2 / 4.0 - latent_uT2[place[i], c]
         row += judged[i]
     return error, needed
+
+
+@njit(cache=True)
+def count_below(bound: float, error_uT: Array, sd_uT: Array, judged: Bools) -> Indices:
+    """(c,) of the judged errors, how many are smaller than `bound` predictive sds."""
+    count = np.zeros(error_uT.shape[1], dtype=np.int64)
+    for i in range(len(judged)):
+        if judged[i]:
+            for c in range(len(count)):
+                count[c] += abs(error_uT[i, c]) < bound * sd_uT[i, c]
+    return count
 
 
 @njit(cache=True)

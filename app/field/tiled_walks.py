@@ -46,7 +46,9 @@ class TiledWalks:
 
     def crossing(self, tile: Tile) -> tuple[str, ...]:
         """The surveys a tile is fitted from, in the walks' order."""
-        return tuple(self._by_survey(self._members[tile]))
+        owner = self._owner[self._members[tile]]
+        first = np.append(0, np.flatnonzero(owner[1:] != owner[:-1]) + 1)
+        return tuple([self._survey_ids[survey] for survey in owner[first].tolist()])
 
     def parts(self, tile: Tile) -> dict[str, Part]:
         """Survey id -> what it measured in the tile, in the walks' order."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.field import consistency
 from app.field.consistency import check_consistency, check_surveys
 from app.field.fit import fit_map
 from app.field.leave_one_out import HeldOut
@@ -104,3 +105,24 @@ def test_every_survey_is_judged_by_the_sds_the_others_show(counts):
         shown = np.clip(1.5 * 1.4826 * np.median(np.concatenate(others), axis=0), 1e-3, 1.0) if others else np.ones(2)
         if len(own.error_uT):
             assert [c.mean_sd_ut for c in reports[name].components] == pytest.approx(shown)
+
+
+def test_counting_tells_when_no_sd_comes_down(monkeypatch):
+    rng = np.random.default_rng(1)
+    n = 40
+
+    def reports(spread):
+        walks = {
+            str(k): HeldOut(
+                spread * rng.normal(size=(n, 1)), np.ones((n, 1)), np.ones(n, dtype=bool), np.arange(float(n))
+            )
+            for k in range(4)
+        }
+        counted = check_surveys(walks, ("norm",), 0.0)
+        with monkeypatch.context() as patched:
+            patched.setattr(consistency, "count_below", lambda *_: np.full(1, n))  # so that medians are taken
+            return counted, check_surveys(walks, ("norm",), 0.0)
+
+    for spread in (0.5, 0.65, 0.7, 0.75, 1.0, 2.0):
+        counted, by_medians = reports(spread)
+        assert counted == by_medians
