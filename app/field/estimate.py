@@ -22,6 +22,7 @@ class FieldEstimate:
     error_sd_uT (c,): of one observation about the latent field
     held_out_mean_uT (n, c), held_out_variance_ratio (n, c) or (n, 1): each survey's observations, by survey id,
     predicted from all the other surveys
+    discredited: surveys so much noisier than the others that they say nothing of the next one's errors
     state: what the next fit can start from; tiles_refitted of all tiles; continued: with what an earlier
     fit had learned
     """
@@ -36,6 +37,7 @@ class FieldEstimate:
     held_out_mean_uT: Mapping[str, Array]
     held_out_variance_ratio: Mapping[str, Array]
     hyperparameters: dict[str, object]
+    discredited: frozenset[str] = frozenset()
     state: FitState | None = None
     tiles_refitted: int = 0
     continued: bool = False

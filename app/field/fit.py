@@ -38,7 +38,7 @@ _ENGINES: dict[Engine, _Estimator] = {
 
 
 RELEARN = 2.0
-"""What was learned is learned anew when there are this many times more, or fewer, samples."""
+"""What was learned is learned anew when there are this many times more, or fewer, samples, or nearly so."""
 REFINING = 0.8
 """Share of the progress that refinement takes."""
 
@@ -102,7 +102,7 @@ def fit_map(
 
 def _about_as_many(learned_from: int, now: int) -> bool:
     """Whether what was learned from so many samples still serves."""
-    return learned_from / RELEARN <= now <= learned_from * RELEARN
+    return learned_from / RELEARN < 0.95 * now and now <= learned_from * RELEARN
 
 
 def _check(spec: MapSpec) -> None:
@@ -144,7 +144,8 @@ def _held_out(
     scatter_uT2 = np.mean([walk.scatter_uT2 for walk in walks], axis=0)
     believed_sd_uT = np.sqrt(np.square(estimate.error_sd_uT) + scatter_uT2)
     nothing = np.zeros((0, len(believed_sd_uT)))
-    shown_sd_uT = noise_sd_by_survey({**needed_uT2, NEW: nothing}, believed_sd_uT)
+    shown = {name: nothing if name in estimate.discredited else needed for name, needed in needed_uT2.items()}
+    shown_sd_uT = noise_sd_by_survey({**shown, NEW: nothing}, believed_sd_uT)
     held_out = {
         name: HeldOut(
             error_uT=error_uT[name],

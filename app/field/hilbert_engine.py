@@ -6,6 +6,7 @@ taken from there. Adding, leaving out or deleting a survey so costs the tiles it
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from app.field.observations import Walk
 from app.field.potential import blend_potentials
 from app.field.raster import Blended, GridFrame, blend, layer_heights_m
 from app.field.spec import MapSpec, Progress
+from app.field.survey_noise import clearly_differ, survey_noise_scales
 from app.field.tile_fit import FitState, Learned, TileFit, fit_tile
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Slab, Tile
@@ -27,6 +29,21 @@ __all__ = ["estimate_by_hilbert"]
 
 FLAT_M = 0.8
 """Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
+DISCREDITED = 10.0
+"""A survey this many times noisier than the others says nothing of the ambient field, or of what errors the next one has."""
+
+
+NOISE_ROUNDS = 2
+"""How often the noise of single surveys is learned, and everything else with it; most maps need none."""
+
+
+class _Fit(NamedTuple):
+    """The tiles of a lattice, what they were fitted with, and every walk predicted from the others."""
+
+    learned: Learned
+    frame: GridFrame
+    tiles: dict[Tile, TileFit]
+    predicted: HeldOutPrediction
 
 
 def estimate_by_hilbert(
@@ -35,31 +52,89 @@ def estimate_by_hilbert(
     """The blended field of all tiles, and the walks predicted by subtraction. Raises InvalidInput for a huge grid."""
     layers_m = layer_heights_m(walks, spec)
     slab_m = _slab(walks, spec, layers_m)
-    if previous is not None and _fits(previous.learned.lattice.slab, slab_m):
-        learned = previous.learned
-    else:
+    if previous is not None and not _fits(previous.learned.lattice.slab, slab_m):
         previous = None
-        ambient_uT = ambient_field_uT(walks)
-        learned = learn(walks, ambient_uT, spec, slab_m, lambda f, message: progress(0.3 * f, message))
-        learned = choose_by_held_out_surveys(walks, learned, spec, lambda f, text: progress(0.3 + 0.1 * f, text))
-    learned = _with_offsets(learned, cleaned.offset_variance_uT2)
     old = previous.tiles if previous is not None and np.array_equal(previous.heights_m, layers_m) else {}
-    lattice, hyper = learned.lattice, learned.hyper
-    frame = GridFrame.around(walks, spec.resolution_m, hyper.length_m, layers_m)
-    components = len(learned.ambient_uT)
-    tiled = TiledWalks(lattice, walks, learned.ambient_uT)
+
+    def learned_with(noise_scale: Mapping[str, float]) -> Learned:
+        ambient_uT = ambient_field_uT([walk for walk in walks if noise_scale[walk.survey_id] < DISCREDITED])
+        learned = learn(walks, ambient_uT, spec, slab_m, lambda f, text: progress(0.3 * f, text), noise_scale)
+        learned = choose_by_held_out_surveys(walks, learned, spec, lambda f, text: progress(0.3 + 0.1 * f, text))
+        return _with_offsets(learned, cleaned.offset_variance_uT2)
+
+    def fitted(learned: Learned, kept: Mapping[Tile, TileFit]) -> _Fit:
+        return _fit_tiles(walks, learned, spec, layers_m, kept, lambda f, text: progress(0.4 + 0.6 * f, text))
+
+    if previous is not None:
+        before = _with_offsets(previous.learned, cleaned.offset_variance_uT2)
+        fit = fitted(before, old)
+        learned = _with_noise_of_new(fit, walks)
+        kept = {tile: each for tile, each in fit.tiles.items() if _as_noisy(each, before, learned)}
+        fit = fitted(learned, kept) if len(kept) < len(fit.tiles) else fit._replace(learned=learned)
+    else:
+        fit = fitted(learned_with(dict.fromkeys((walk.survey_id for walk in walks), 1.0)), old)
+        for _ in range(NOISE_ROUNDS):
+            noise_scale = fit.learned.hyper.noise_scale | survey_noise_scales(fit.learned, walks, fit.predicted)
+            if not clearly_differ(fit.learned.hyper.noise_scale, noise_scale):
+                break
+            fit = fitted(learned_with(noise_scale), {})
+    return _estimate(fit, walks, cleaned, spec, layers_m, previous is not None, old)
+
+
+def _fit_tiles(
+    walks: Sequence[Walk],
+    learned: Learned,
+    spec: MapSpec,
+    layers_m: Array,
+    kept: Mapping[Tile, TileFit],
+    progress: Progress,
+) -> _Fit:
+    """One tile after the other; those of `kept` that the same surveys cross are taken as they are."""
+    frame = GridFrame.around(walks, spec.resolution_m, learned.hyper.length_m, layers_m)
+    tiled = TiledWalks(learned.lattice, walks, learned.ambient_uT)
     tiles: dict[Tile, TileFit] = {}
     count = len(tiled.counts())
     for index, tile in enumerate(tiled.counts()):
-        fit = old.get(tile)
+        fit = kept.get(tile)
         if fit is None or fit.surveys != tiled.crossing(tile):
-            progress(0.4 + 0.6 * index / count, f"fitting tile {index + 1} of {count}")
+            progress(index / count, f"fitting tile {index + 1} of {count}")
             fit = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m, spec.robust)
         tiles[tile] = fit
-    blended = _blend(lattice, frame, spec, tiles)
-    predicted = HeldOutPrediction(lattice, walks, len(blended.variance_ratio))
+    predicted = HeldOutPrediction(learned.lattice, walks, len(next(iter(tiles.values())).patch.variance_ratio))
     for tile, fit in tiles.items():
         predicted.add(tile, tiled.all_answered(tile), fit.held_out)
+    return _Fit(learned, frame, tiles, predicted)
+
+
+def _with_noise_of_new(fit: _Fit, walks: Sequence[Walk]) -> Learned:
+    """What was learned, with the noise of surveys that came since; those of before keep theirs."""
+    hyper = fit.learned.hyper
+    present = [walk.survey_id for walk in walks]
+    found = {}
+    if any(name not in hyper.noise_scale for name in present):
+        found = survey_noise_scales(fit.learned, walks, fit.predicted)
+    noise_scale = {name: hyper.noise_scale.get(name, found.get(name, 1.0)) for name in present}
+    return replace(fit.learned, hyper=replace(hyper, noise_scale=noise_scale))
+
+
+def _as_noisy(fit: TileFit, before: Learned, after: Learned) -> bool:
+    """Whether the surveys of a tile are as noisy as they were taken to be."""
+    return all(before.hyper.noise_scale.get(name, 1.0) == after.hyper.noise_scale[name] for name in fit.surveys)
+
+
+def _estimate(
+    fit: _Fit,
+    walks: Sequence[Walk],
+    cleaned: Cleaned,
+    spec: MapSpec,
+    layers_m: Array,
+    continued: bool,
+    old: Mapping[Tile, TileFit],
+) -> FieldEstimate:
+    learned, frame, tiles, predicted = fit
+    lattice, hyper = learned.lattice, learned.hyper
+    blended = _blend(lattice, frame, spec, tiles)
+    components = len(learned.ambient_uT)
     prior_sd_uT, error_sd_uT = (np.broadcast_to(sd, components) for sd in (hyper.signal_sd_uT, hyper.error_sd_uT))
     return FieldEstimate(
         frame=frame,
@@ -72,9 +147,10 @@ def estimate_by_hilbert(
         held_out_mean_uT=predicted.mean_uT,
         held_out_variance_ratio=predicted.variance_ratio,
         hyperparameters=hyper.as_json() | {"tile_pitch_m": lattice.pitch_m},
+        discredited=frozenset(name for name, scale in hyper.noise_scale.items() if scale >= DISCREDITED),
         state=FitState(learned, layers_m, cleaned.hard_iron, tiles),
-        continued=previous is not None,
-        tiles_refitted=sum(fit is not old.get(tile) for tile, fit in tiles.items()),
+        continued=continued,
+        tiles_refitted=sum(each is not old.get(tile) for tile, each in tiles.items()),
     )
 
 

@@ -28,8 +28,8 @@ class Hyperparameters:
     bias_ratio, walk_ratio, white_ratio: variances of a survey's offset in a tile, of the error correlated along the
     walk and of the white error, over the signal's. r is the distance between places, s the distance walked.
     offset_ratio: survey id -> variance, over the signal's, of what may be left of its sensor's own constant field.
-    short_length_m, short_share: of the second kernel of a sum. noise_scale: survey id -> factor on the variances of its
-    walk and white error; 1 for those not named.
+    short_length_m, short_share: of the second kernel of a sum. noise_scale: survey id -> factor on the variances of all
+    its errors; 1 for those not named.
     """
 
     kernel: Kernel
@@ -41,7 +41,7 @@ class Hyperparameters:
     walk_length_m: float = 1.0
     short_length_m: float | None = None
     short_share: float = 0.0
-    noise_scale: Mapping[str, float] = field(default_factory=dict)
+    noise_scale: dict[str, float] = field(default_factory=dict)
     offset_ratio: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -85,7 +85,8 @@ class Hyperparameters:
         return own * self.noise_scale.get(survey_id, 1.0)
 
     def bias_ratio_of(self, survey_id: str) -> float:
-        return self.bias_ratio + self.offset_ratio.get(survey_id, 0.0)
+        scale = self.noise_scale.get(survey_id, 1.0)
+        return self.bias_ratio * scale + self.offset_ratio.get(survey_id, 0.0)
 
     def source_variance_ratio(self, basis: Basis) -> float:
         """Variance of the divergence allowed in air, over the signal's variance, 1/m^2; only of a potential."""
@@ -103,7 +104,7 @@ class Hyperparameters:
         short = {}
         if self.short_length_m is not None:
             short = {"short_length_m": self.short_length_m, "short_share": self.short_share}
-        scale = {"survey_noise_scale": dict(self.noise_scale)} if self.noise_scale else {}
+        noisier = {name: scale for name, scale in self.noise_scale.items() if scale != 1.0}
         return {
             "kernel": self.kernel,
             "length_m": self.length_m,
@@ -113,7 +114,7 @@ class Hyperparameters:
             "walk_noise_sd_ut": (self.signal_sd_uT * np.sqrt(self.walk_ratio)).tolist(),
             "walk_noise_length_m": self.walk_length_m,
             "survey_bias_sd_ut": (self.signal_sd_uT * np.sqrt(self.bias_ratio)).tolist(),
-            **scale,
+            **({"survey_noise_scale": noisier} if noisier else {}),
         }
 
 

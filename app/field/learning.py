@@ -7,6 +7,7 @@ rest from the statistics, starting where the nearest trial ended, with the curva
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from app.field.marginal_likelihood import START_LOG, TOLERANCE, MostLikely, Tile
 from app.field.marginal_likelihood import learn as most_likely
 from app.field.observations import Walk
 from app.field.spec import BaseKernel, Kernel, MapSpec, Progress
+from app.field.statistics import SurveyStatistics
 from app.field.tile_fit import Learned
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
@@ -72,8 +74,16 @@ def _start_with(found: MostLikely, noise: WalkNoise) -> Array:
 class _Learner:
     """A few well-walked tiles of one lattice, to learn on."""
 
-    def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array, kernel: Kernel) -> None:
+    def __init__(
+        self,
+        lattice: Lattice,
+        walks: Sequence[Walk],
+        ambient_uT: Array,
+        kernel: Kernel,
+        noise_scale: Mapping[str, float],
+    ) -> None:
         self._kernel = kernel
+        self._noise_scale = noise_scale
         self._pin_bias = len(walks) == 1
         finest = LEARNABLE[0] if lattice.slab is None else LEARNABLE_IN_SLAB
         longest = LEARNABLE[1] if lattice.slab is None else LONGEST_IN_SLAB
@@ -85,18 +95,30 @@ class _Learner:
         self, noise: WalkNoise, start_log: Array, curvature: Array | None = None, tolerance: float = TOLERANCE
     ) -> MostLikely:
         tiles = [
-            TileStatistics.of(self._tiled.lattice.basis(tile), self._tiled.statistics(tile, noise).values())
+            TileStatistics.of(self._tiled.lattice.basis(tile), self._scaled(self._tiled.statistics(tile, noise)))
             for tile in self._chosen
         ]
         return most_likely(
             tiles, self._kernel, noise, start_log, self._length_bounds_m, self._pin_bias, tolerance, curvature
         )
 
+    def _scaled(self, surveys: Mapping[str, SurveyStatistics]) -> list[SurveyStatistics]:
+        """Every survey's statistics under its own noise."""
+        return [survey.scaled(self._noise_scale.get(name, 1.0)) for name, survey in surveys.items()]
+
 
 def learn(
-    walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, slab_m: tuple[float, float] | None, progress: Progress
+    walks: Sequence[Walk],
+    ambient_uT: Array,
+    spec: MapSpec,
+    slab_m: tuple[float, float] | None,
+    progress: Progress,
+    noise_scale: Mapping[str, float] = MappingProxyType({}),
 ) -> Learned:
-    """Maximum marginal likelihood, and the lattice that suits the length found: of slabs between heights `slab_m`."""
+    """Maximum marginal likelihood, and the lattice that suits the length found: of slabs between heights `slab_m`.
+
+    noise_scale: survey id -> factor on the variances of its errors, 1 for those not named.
+    """
     kernel = spec.covariance
 
     def learning_lattice(length_m: float) -> Lattice:
@@ -112,7 +134,7 @@ def learn(
     good_enough, finest = (GOOD_ENOUGH, LEARNABLE[0]) if slab_m is None else (GOOD_ENOUGH_SLAB, LEARNABLE_IN_SLAB)
     for turn in range(ROUNDS):
         progress(0.5 * turn / ROUNDS, "learning length and noise")
-        learner = _Learner(lattice, walks, ambient_uT, kernel)
+        learner = _Learner(lattice, walks, ambient_uT, kernel, noise_scale)
         found = learner.learn(WHITE, start_log)
         start_log = found.log_parameters
         suited = learning_lattice(found.hyper.finest_length_m)
@@ -122,7 +144,7 @@ def learn(
         lattice = suited
     if spec.noise == "walk":
         found = _learn_walk_noise(learner, found, progress)
-    hyper = found.hyper
+    hyper = replace(found.hyper, noise_scale=dict(noise_scale))
     if spec.curl_free and slab_m is not None and slab_m[1] - slab_m[0] < ONE_HEIGHT_M:
         short = hyper.short_length_m
         hyper = replace(

@@ -29,7 +29,8 @@ def student_evidence(tiled: TiledWalks, tile: Tile, hyper: Hyperparameters) -> d
         scales = {}
         for survey_id, part in parts.items():
             mean_uT, variance_ratio = fitted.at(part.points_m)
-            noise_ratio = hyper.bias_ratio + hyper.walk_ratio + hyper.white_ratio_in(basis, survey_id)
+            scale = hyper.noise_scale.get(survey_id, 1.0)
+            noise_ratio = hyper.white_ratio_in(basis, survey_id) + scale * (hyper.bias_ratio + hyper.walk_ratio)
             squared = np.mean(np.square((part.deviation_uT - mean_uT) / hyper.signal_sd_uT), axis=1)
             squared = squared + variance_ratio.mean(axis=1)
             scales[survey_id] = (FREEDOM + squared / noise_ratio) / (FREEDOM + 1.0)

@@ -11,7 +11,7 @@ up to a little, is one more row.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -61,6 +61,20 @@ class SurveyStatistics:
     log_det_shape: float
     count: int
     sources: Array | None = None
+
+    def scaled(self, factor: float) -> "SurveyStatistics":
+        """Of the same walk when the variances of all its errors, offset included, are larger by a factor."""
+        if factor == 1.0:
+            return self
+        return replace(
+            self,
+            gram=Gram(self.gram.table / factor, self.gram.of_moments),
+            target=self.target / factor,
+            offsets=self.offsets / np.sqrt(factor),
+            ones_target=self.ones_target / np.sqrt(factor),
+            energy=self.energy / factor,
+            log_det_shape=self.log_det_shape + self.count * float(np.log(factor)),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
