@@ -53,24 +53,34 @@ def add_at_points(
 
 @njit(cache=True)
 def add_cells(
-    mean: Array, gradient: Array, variance: Array, own: tuple[Array, Array, Array], along_x: Array, along_y: Array
+    mean: Array,
+    gradient: Array,
+    variance: Array,
+    own: tuple[Array, Array, Array],
+    first: tuple[int, int],
+    skipped: tuple[int, int],
+    along_y: Array,
+    along_x: Array,
 ) -> None:
     """Add a tile's mean (c, z, y, x), gradient (d, c, z, y, x) and variance (v, z, y, x) less one, under its weights.
 
-    along_x (3, x), along_y (3, y): `weights`. The gradient is that of the weighted mean: weights vary too.
+    along_y (3, n), along_x (3, m): `weights` of the n rows and m columns that are added, from row and column `first` of
+    the grid and `skipped` of the tile. The gradient is that of the weighted mean: weights vary too.
     """
     own_mean, own_gradient, own_variance = own
-    components, heights, rows, columns = own_mean.shape
+    components, heights = own_mean.shape[:2]
     for z in range(heights):
-        for y in range(rows):
-            for x in range(columns):
-                weight = along_x[0, x] * along_y[0, y]
+        for row in range(along_y.shape[1]):
+            y, v = first[0] + row, skipped[0] + row
+            for column in range(along_x.shape[1]):
+                x, u = first[1] + column, skipped[1] + column
+                weight = along_x[0, column] * along_y[0, row]
                 for c in range(components):
-                    value = own_mean[c, z, y, x]
+                    value = own_mean[c, z, v, u]
                     mean[c, z, y, x] += weight * value
                     for axis in range(len(own_gradient)):
-                        gradient[axis, c, z, y, x] += weight * own_gradient[axis, c, z, y, x]
-                    gradient[0, c, z, y, x] += along_x[1, x] * along_y[0, y] * value
-                    gradient[1, c, z, y, x] += along_x[0, x] * along_y[1, y] * value
-                for v in range(len(own_variance)):
-                    variance[v, z, y, x] += weight * (own_variance[v, z, y, x] - 1.0)
+                        gradient[axis, c, z, y, x] += weight * own_gradient[axis, c, z, v, u]
+                    gradient[0, c, z, y, x] += along_x[1, column] * along_y[0, row] * value
+                    gradient[1, c, z, y, x] += along_x[0, column] * along_y[1, row] * value
+                for k in range(len(own_variance)):
+                    variance[k, z, y, x] += weight * (own_variance[k, z, v, u] - 1.0)

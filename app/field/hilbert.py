@@ -10,18 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.lapack import dlauum, dpotrf, dpotrs
 
 from app.field.basis import CosineBasis
 from app.field.hyperparameters import Basis, Hyperparameters
 from app.field.moments import VarianceSeries, cosines, scaled_functions, scaled_functions_on_lattice
 from app.field.slab import SlabBasis
 from app.field.statistics import Evidence
+from app.field.triangular import inverse_of_lower
 from app.geometry import Array
 
 __all__ = ["Patch", "PlanePosterior", "SlabPosterior", "posterior", "predict"]
 
-FEW_POINTS = 1.0
+FEW_POINTS = 0.7
 """Per function: of more, their variances cost less by way of the covariance of the weights."""
 
 
@@ -144,7 +145,7 @@ def posterior(
         return SlabPosterior(basis, weights_uT, factor, root, detail_ratio)
     if points is not None and points <= FEW_POINTS * basis.size:
         return PlanePosterior(basis, weights_uT, _Solved(basis, factor, root), detail_ratio)
-    covariance, info = dpotri(factor, lower=1, overwrite_c=1)
+    covariance, info = dlauum(inverse_of_lower(factor), lower=1, overwrite_c=1)
     assert info == 0, info
     return PlanePosterior(basis, weights_uT, VarianceSeries.of(basis, covariance, root), detail_ratio)
 

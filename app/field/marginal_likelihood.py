@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dgemm
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg.lapack import dpotrf
 from scipy.special import expit
 
 from app.field.descent import descend
@@ -21,6 +21,7 @@ from app.field.hyperparameters import Basis, Hyperparameters, weight_variance
 from app.field.kernels import is_sum, log_spectral_slope
 from app.field.spec import Kernel
 from app.field.statistics import Gram, SurveyStatistics
+from app.field.triangular import inverse_of_lower
 from app.field.walk_noise import WalkNoise
 from app.geometry import Array
 
@@ -215,7 +216,7 @@ def _tile_terms(tile: TileStatistics, hyper: Hyperparameters, prior: _Prior) -> 
     np.einsum("ii->i", precision)[:] += 1.0
     factor, info = dpotrf(precision, lower=1, clean=1, overwrite_a=1)
     assert info == 0, info
-    inverse, _ = dtrtri(factor, lower=1)
+    inverse = inverse_of_lower(factor)
     z = inverse.T @ (inverse @ target) / white
     explained = np.sum(z * target, axis=0)
     misfit = energy - explained - white * np.sum(np.square(z), axis=0)

@@ -92,10 +92,9 @@ def blend(lattice: Lattice, frame: GridFrame, resolution_m: float, patches: Mapp
     across = {i: _along(lattice, 0, tile, resolution_m, frame.x_m) for i, tile in columns.items()}
     up = {j: _along(lattice, 1, tile, resolution_m, frame.y_m) for j, tile in rows.items()}
     for (column, row), patch in patches.items():
-        (x, own_x, along_x), (y, own_y, along_y) = across[column], up[row]
-        own_mean, own_gradient, own_variance = (values[..., own_y, own_x] for values in patch[:3])
-        own = own_mean, own_gradient, own_variance
-        add_cells(mean[..., y, x], gradient[..., y, x], variance[..., y, x], own, along_x, along_y)
+        (y, own_y, along_y), (x, own_x, along_x) = up[row], across[column]
+        first, skipped = (y.start, x.start), (own_y.start, own_x.start)
+        add_cells(mean, gradient, variance, patch[:3], first, skipped, along_y, along_x)
     return Blended(mean, gradient, variance)
 
 

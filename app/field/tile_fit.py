@@ -99,10 +99,10 @@ def _held_out(
         predict(basis, total - evidence[survey_id], learned.hyper, tiled.points_m[inside])
         for survey_id, inside in answered.items()
     ]
-    return HeldOutPart(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return HeldOutPart(*(np.ascontiguousarray(np.concatenate(each)) for each in zip(*parts, strict=True)))
 
 
 def _rounded(patch: Patch) -> Patch:
     """To single precision, in which a fit is kept: one that was kept and one that was not must not differ."""
-    mean, gradient, variance = (values.astype(np.float32).astype(np.float64) for values in patch[:3])
+    mean, gradient, variance = (values.astype(np.float32, order="C").astype(np.float64) for values in patch[:3])
     return Patch(mean, gradient, variance, patch.potential_uT_m)
