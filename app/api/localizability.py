@@ -76,7 +76,9 @@ def get_localizability(
     noise_ut: Annotated[Finite, Query(ge=0.0, le=1000.0, description="white noise of one reading, per axis")] = 0.5,
     bias: Annotated[Knowledge, Query(description="a constant offset of the sensor (unknown: demeaned)")] = "known",
     heading: Annotated[Knowledge, Query(description="of the window's frame")] = "unknown",
-    height_m: Annotated[Metres | None, Query(description="the nearest of the map's heights is judged")] = None,
+    height_m: Annotated[
+        Metres | None, Query(description="the nearest of the map's heights, within half a metre, is judged")
+    ] = None,
 ) -> Response:
     """Gradients of the field, and the least error (Cramer-Rao) of windows of this length and sensor.
 

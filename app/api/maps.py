@@ -27,7 +27,7 @@ from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFou
 from app.field.grid import FieldGrid
 from app.field.kernels import base_kernel, is_sum
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
-from app.field.spec import Kernel, Noise
+from app.field.spec import Kernel, MapSpec, Noise
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
@@ -89,6 +89,13 @@ class MapView(BaseModel):
     floor_id: str
     engine: str
     components: Components | None
+    kernel: Annotated[Kernel, Field(description="of the prior; what was asked for, or the default")]
+    curl_free: bool
+    heights_m: Annotated[list[float] | None, Field(description="as asked; null: one layer at the samples' median")]
+    noise: Annotated[Noise, Field(description="engines exact and compromise know white noise only, whatever this says")]
+    hard_iron: bool
+    robust: bool
+    refine: bool
     status: Literal["accepted", "running", "ready", "failed", "dismissed"]
     active: bool
     created_at: datetime
@@ -127,11 +134,13 @@ class FieldAnswer(BaseModel):
 
 
 def show_map(row: Map, active_map_id: str | None) -> MapView:
+    asked = MapSpec(**row.spec)
+    same = ("engine", "curl_free", "heights_m", "noise", "hard_iron", "robust", "refine", "resolution_m")
     return MapView.model_validate(
         {
-            "engine": row.spec.get("engine", "hilbert"), "active": row.id == active_map_id, "sha256": row.grid_sha256,
-            "resolution_m": row.spec.get("resolution_m", 0.25),
+            "active": row.id == active_map_id, "sha256": row.grid_sha256, "kernel": asked.covariance,
             "components": row.components or row.spec.get("components"),
+            **{name: getattr(asked, name) for name in same},
             **{name: getattr(row, name) for name in
                ("id", "floor_id", "status", "created_at", "bounds_m", "hyperparameters", "score", "score_reason",
                 "survey_ids")},
@@ -315,7 +324,9 @@ def get_heatmap(
     context: ContextDep,
     identity: Reading,
     layer: Annotated[str, Query(max_length=40, examples=["norm", "bx", "sd", "gradient"])] = "norm",
-    height_m: Annotated[Metres | None, Query(description="the nearest of the map's heights is shown")] = None,
+    height_m: Annotated[
+        Metres | None, Query(description="the nearest of the map's heights, within half a metre, is shown")
+    ] = None,
 ) -> Response:
     """A map's layers follow from its components; an answer to a wrong name lists them."""
     from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import InvalidInput
+from app.errors import Fault, InvalidInput
 from app.field.expected_error import WindowModel, expected_error_m, point_information
 from app.field.grid import FieldGrid
 from app.field.localizability import gradient_norms
@@ -30,6 +30,7 @@ __all__ = [
 ]
 
 StoredLayers = Mapping[str, NDArray[np.floating]]  # (nz, ny, nx) by name, of one map
+FARTHEST_M = 0.5  # from the height asked for to the one shown
 NONE_STORED: StoredLayers = MappingProxyType({})
 
 
@@ -70,8 +71,18 @@ def layer_names(components: Components, stored: Collection[str] = ()) -> tuple[s
 
 
 def nearest_height(grid: FieldGrid, height_m: float | None) -> int:
-    """The index of the map's height that is nearest to `height_m` (of two as near the lower; None: the lowest)."""
-    return 0 if height_m is None else int(np.argmin(np.abs(grid.heights_m - height_m)))
+    """The index of the map's height that is nearest to `height_m` (of two as near the lower; None: the lowest).
+
+    Raises InvalidInput, naming the heights there are, when none is within `FARTHEST_M`.
+    """
+    if height_m is None:
+        return 0
+    away_m = np.abs(grid.heights_m - height_m)
+    if away_m.min() > FARTHEST_M + 1e-9:
+        heights = ", ".join(f"{z:.2f}" for z in grid.heights_m)
+        reason = f"{height_m:g} m is farther than {FARTHEST_M:g} m from every height of this map: {heights} m"
+        raise InvalidInput(reason, Fault("/query/height_m", reason))
+    return int(np.argmin(away_m))
 
 
 def check_layer(grid: FieldGrid, layer: str, stored: Collection[str] = ()) -> None:

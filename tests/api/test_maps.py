@@ -97,11 +97,16 @@ def test_heat_maps_are_pictures(service: Any, active_map: str, layer: str) -> No
 
 def test_the_nearest_height_is_the_one_picture_of_all_near_it(service: Any, active_map: str) -> None:
     path = f"/v1/maps/{active_map}/heatmap.png"
-    etags = {service.http.get(path, params=asked).headers["etag"] for asked in ({}, {"height_m": 1}, {"height_m": 99})}
+    etags = {service.http.get(path, params=asked).headers["etag"] for asked in ({}, {"height_m": 1}, {"height_m": 1.7})}
     assert len(etags) == 1, "a map of one height"
     assert service.http.get(path, params={"layer": "sd"}).headers["etag"] not in etags
     assert service.http.get(path, headers={"If-None-Match": etags.pop()}).status_code == 304
     assert service.http.get(path, params={"height_m": "nan"}).status_code == 422
+    for far in (path, f"/v1/maps/{active_map}/localizability"):
+        refused = service.http.get(far, params={"height_m": 1.8})
+        assert refused.status_code == 422, "six decimetres from the only height"
+        assert "1.20 m" in refused.json()["detail"]
+        assert refused.json()["errors"][0]["location"] == "/query/height_m"
 
 
 @pytest.mark.parametrize("layer", ["colour", "coverage", "horizontal", "a b\r\nc", "Ω"])
@@ -317,6 +322,27 @@ def test_a_rebuild_continues_the_last_fit_and_says_what_changed(service: Any, ne
     assert without["changes"]["surveys_removed"] == again["changes"]["surveys_added"] == [last]
     assert without["sha256"] != first["sha256"] == again["sha256"]
     assert service.blob_count() == blobs + 5, "two grids, layers, three reports, and of the states of fits the last two"
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown"),
+    [
+        ({}, {"kernel": "matern32", "noise": "walk", "hard_iron": True, "heights_m": None, "robust": False}),
+        ({"curl_free": True}, {"kernel": "squared_exponential", "curl_free": True, "refine": False}),
+        ({"heights_m": [0.9, 1.5], "noise": "white", "hard_iron": False, "robust": True}, {"curl_free": False}),
+        ({"kernel": "matern52+matern52", "refine": True}, {}),
+    ],
+)
+def test_a_map_shows_what_was_asked_for(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], asked: Any, shown: Any
+) -> None:
+    floor = new_floor(auto_build=False)
+    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
+    answer = service.http.post(f"/v1/floors/{floor}/maps", json=asked).json()
+    made = service.http.get(f"/v1/maps/{answer['map']['id']}").json()
+    assert made == answer["map"]
+    assert {name: made[name] for name in asked | shown} == asked | shown
+    service.http.delete(f"/v1/jobs/{answer['job']['id']}")
 
 
 def test_pointers_have_etags_that_follow_their_state(service: Any, mapped_floor: str, active_map: str) -> None:
