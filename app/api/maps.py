@@ -22,6 +22,7 @@ from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Metres, Point, RequestModel
 from app.api.problems import ERROR_RESPONSES
+from app.api.windows import AskedWindowDep
 from app.db.tables import Floor, Map, Survey
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
 from app.field.grid import FieldGrid
@@ -299,14 +300,18 @@ def get_export(
     identity: Reading,
     format: Annotated[ExportFormat, Query()],
     gradient: Annotated[bool, Query(description="also the derivatives with x and y (z where the map knows it)")] = True,
+    localizability: Annotated[
+        bool, Query(description="also gradient norms, information and expected error (10 m window, 0.5 uT noise)")
+    ] = False,
 ) -> Response:
     """Mean, standard deviation, gradient and the layers of the fit, at every height; unmeasured cells are missing."""
     ready = ready_map(context, identity, map_id)
 
     def file() -> bytes:
-        return export_map(ready.grid, format, ready.sha256, ready.stored_layers(context), gradient)
+        return export_map(ready.grid, format, ready.sha256, ready.stored_layers(context), gradient, localizability)
 
-    response = immutable(request, ready.tag(format, f"gradient={gradient}"), file, MEDIA_TYPES[format])
+    tag = ready.tag(format, f"gradient={gradient}", *["localizability"] * localizability)
+    response = immutable(request, tag, file, MEDIA_TYPES[format])
     name = f"isodyn-{ready.sha256[:12]}.{EXTENSIONS[format]}"
     response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
     return response
@@ -323,21 +328,27 @@ def get_heatmap(
     request: Request,
     context: ContextDep,
     identity: Reading,
-    layer: Annotated[str, Query(max_length=40, examples=["norm", "bx", "sd", "gradient"])] = "norm",
+    asked: AskedWindowDep,
+    layer: Annotated[str, Query(max_length=40, examples=["norm", "bx", "sd", "expected_error"])] = "norm",
     height_m: Annotated[
         Metres | None, Query(description="the nearest of the map's heights, within half a metre, is shown")
     ] = None,
 ) -> Response:
-    """A map's layers follow from its components; an answer to a wrong name lists them."""
+    """A map's layers follow from its components; an answer to a wrong name lists them.
+
+    Window and sensor are those of the layer `expected_error`; `information` takes `noise_ut`; no other takes any.
+    """
     from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it
 
     ready = ready_map(context, identity, map_id)
     stored = ready.stored_layers(context)
     check_layer(ready.grid, layer, stored)
-    k = nearest_height(ready.grid, height_m)
-    return immutable(
-        request, ready.tag(layer, k), lambda: heatmap_png(ready.grid, layer, height_index=k, stored=stored), "image/png"
-    )
+    used, k = asked.of_layer(request, layer), nearest_height(ready.grid, height_m)
+
+    def picture() -> bytes:
+        return heatmap_png(ready.grid, layer, height_index=k, stored=stored, window=asked.model())
+
+    return immutable(request, ready.tag(layer, k, *used), picture, "image/png")
 
 
 @router.get(

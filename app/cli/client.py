@@ -100,9 +100,11 @@ def export(
     key: KeyOption,
     url: Url = DEFAULT_URL,
     format: Annotated[str, typer.Option(help="netcdf, zarr, npz, covjson or csv")] = "netcdf",
+    localizability: Annotated[bool, typer.Option(help="also gradient norms, information, expected error")] = False,
 ) -> None:
     """Write a map as a file for other tools."""
-    answer = Api(url, key).call("GET", f"/v1/maps/{map_id}/export", params={"format": format})
+    asked = {"format": format, "localizability": localizability}
+    answer = Api(url, key).call("GET", f"/v1/maps/{map_id}/export", params=asked)
     output.write_bytes(answer.content)
     print(f"{output}: {len(answer.content):,} bytes")
 

@@ -57,11 +57,15 @@ def test_an_export_has_the_layers_of_the_fit_and_no_gradient_on_request(
     def export(map_id: str, **more: str) -> Any:
         return service.http.get(f"/v1/maps/{map_id}/export", params={"format": format, **more})
 
-    answers = [export(layered_map), export(layered_map, gradient="false"), export(old_map)]
-    assert [answer.status_code for answer in answers] == [200, 200, 200]
-    assert len({answer.headers["etag"] for answer in answers}) == 3
-    assert [b"coverage" in answer.content for answer in answers] == [True, True, False]
-    assert [b"dbx_dy_ut_per_m" in answer.content for answer in answers] == [True, False, True]
+    answers = [
+        export(layered_map), export(layered_map, gradient="false"), export(old_map),
+        export(layered_map, localizability="true"),
+    ]  # fmt: skip
+    assert [answer.status_code for answer in answers] == [200] * 4
+    assert len({answer.headers["etag"] for answer in answers}) == 4
+    assert [b"coverage" in answer.content for answer in answers] == [True, True, False, True]
+    assert [b"dbx_dy_ut_per_m" in answer.content for answer in answers] == [True, False, True, True]
+    assert [b"expected_error_m" in answer.content for answer in answers] == [False, False, False, True]
     assert answers[0].headers["content-disposition"].startswith('attachment; filename="isodyn-')
 
 
