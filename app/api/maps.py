@@ -30,6 +30,7 @@ from app.field.kernels import base_kernel, is_sum
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
 from app.field.spec import Kernel, MapSpec, Noise
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
+from app.services.exact_limit import TOO_MANY, outgrow_exact
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
 
@@ -197,6 +198,16 @@ def _check_surveys(session: Session, floor_id: str, body: NewMap) -> list[str]:
     return sorted(row.id for row in rows)
 
 
+def _check_engine(session: Session, context: Context, row: Map) -> None:
+    """Refuse surveys that hold more than the engine takes."""
+    if row.spec["engine"] != "exact":
+        return
+    stored = session.scalars(select(Survey.samples_sha256).where(Survey.id.in_(row.survey_ids))).all()
+    if outgrow_exact(samples_from_bytes(context.blobs.get(sha256)) for sha256 in stored):
+        reason = f"{TOO_MANY}: use engine compromise or hilbert, or name fewer survey_ids"
+        raise InvalidInput(reason, Fault("/body/engine", reason))
+
+
 @router.post("/floors/{floor_id}/maps", status_code=202, response_model=NewMapAnswer, summary="Build a map")
 def create_map(
     floor_id: Id, body: NewMap, request: Request, context: ContextDep, identity: MapWriting, key: IdempotencyKey = None
@@ -215,6 +226,7 @@ def create_map(
             spec=body.model_dump(exclude={"survey_ids", "activate"}, exclude_none=True),
             survey_ids=_check_surveys(session, floor.id, body),
         )
+        _check_engine(session, context, row)
         session.add(row)
         session.flush()
         job = context.queue.enqueue_build(session, row)

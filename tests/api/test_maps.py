@@ -349,6 +349,44 @@ def test_a_map_shows_what_was_asked_for(
     service.http.delete(f"/v1/jobs/{answer['job']['id']}")
 
 
+def test_a_floor_that_outgrows_the_exact_engine_is_built_by_the_default_one(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes]
+) -> None:
+    floor = new_floor()
+    asked = {"engine": "exact", "components": "norm", "resolution_m": 0.5}
+
+    def upload(*walk: float) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The job that follows, and its map."""
+        job = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(*walk)).json()["job"]
+        service.run_jobs()
+        ended = service.http.get(f"/v1/jobs/{job['id']}").json()
+        return ended, service.http.get(f"/v1/maps/{ended['map_id']}").json()
+
+    upload(1, 4.0, 3.0)
+    assert service.http.post(f"/v1/floors/{floor}/maps", json=asked).status_code == 202
+    service.run_jobs()
+    job, still = upload(2, 4.0, 3.0)
+    assert (still["engine"], job["result"]["changes"]["fallback"]) == ("exact", None)
+    for walk in ((3, 100.0, 8.0), (4, 6.0, 4.0)):
+        job, grown = upload(*walk)
+        assert (job["status"], grown["active"], grown["engine"]) == ("successful", True, "hilbert")
+        assert (grown["components"], grown["resolution_m"]) == ("norm", 0.5), "the rest stays as asked"
+        quality = service.http.get(f"/v1/maps/{grown['id']}/quality").json()
+        told = quality["changes"]["fallback"]
+        if walk[0] == 3:
+            assert "at most 2000 observations" in told
+            assert told in job["message"]
+        else:
+            assert told is None, "it was said once"
+            assert quality["changes"]["hyperparameters"] == "kept"
+    refused = service.http.post(f"/v1/floors/{floor}/maps", json=asked)
+    assert refused.status_code == 422
+    assert refused.json()["errors"][0]["location"] == "/body/engine"
+    few = still["survey_ids"]
+    assert service.http.post(f"/v1/floors/{floor}/maps", json=asked | {"survey_ids": few}).status_code == 202
+    service.run_jobs()
+
+
 def test_pointers_have_etags_that_follow_their_state(service: Any, mapped_floor: str, active_map: str) -> None:
     for path in (f"/v1/floors/{mapped_floor}", f"/v1/maps/{active_map}"):
         first = service.http.get(path)
