@@ -21,7 +21,7 @@ from app.api.models import Id, Name, RequestModel
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Floor, Job, Map, Survey
 from app.errors import NotFound
-from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency
+from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency, WalkLocalizability
 from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
 from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
@@ -217,6 +217,9 @@ class ConsistencyView(BaseModel):
     reason: str | None
     change_point: Annotated[
         ChangePoint | None, Field(description="where in the log errors changed; null when nowhere clearly")
+    ] = None
+    localizability: Annotated[
+        WalkLocalizability | None, Field(description="Kuevor's GLM (B30); null when too few samples can be judged")
     ] = None
 
 

@@ -37,6 +37,12 @@ def test_a_survey_is_received_mapped_and_judged(service: Any, new_floor: NewFloo
     assert verdict["status"] == "consistent", verdict
     assert [c["component"] for c in verdict["components"]] == ["bx", "by", "bz"]
     assert verdict["change_point"] is None
+    told = verdict["localizability"]
+    assert told["step_m"] == 0.05
+    assert told["glm_ratio_of_means"] == pytest.approx(told["mean_signal_ut"] / told["mean_noise_ut"])
+    assert told["mean_noise_ut"] == pytest.approx(sum(c["rmse_ut"] ** 2 for c in verdict["components"]) ** 0.5, rel=0.2)
+    assert 0.1 < told["mean_signal_ut"] < 0.7, "fields of 2 to 14 uT/m"
+    assert told["glm_p5"] < told["glm_p50"] < told["glm_p95"]
     scored = floor_map["score"]
     assert scored["rmse_vec_ut"] == pytest.approx(sum(rmse**2 for rmse in scored["rmse_ut"]) ** 0.5)
     assert 0.0 < scored["rmse_of_norm_ut"] <= scored["rmse_vec_ut"]
