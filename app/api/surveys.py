@@ -143,7 +143,12 @@ async def upload_survey(
     ] = None,
     replaces: Annotated[
         str | None,
-        Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$", description="a survey of this floor whose place it takes"),
+        Query(
+            max_length=64,
+            pattern=r"^[A-Za-z0-9_-]+$",
+            description="a survey of this floor whose place it takes",
+            examples=["0197c1a2-0b7e-7c3d-9a52-5f0e8d6b4c21"],
+        ),
     ] = None,
     key: IdempotencyKey = None,
 ) -> Response:

@@ -108,14 +108,14 @@ def was_replaced(session: Session, floor: Floor, survey_id: str) -> bool:
 
 
 def _same_survey(session: Session, floor_id: str, parsed: ParsedSurvey, replaces: str | None) -> Survey | None:
-    """The first survey of the same bytes or samples; one of other samples that is to go is none."""
+    """The first survey of the same samples, else of the same bytes; one of other samples that is to go is none."""
     same_bytes = and_(
         Survey.raw_sha256 == parsed.raw_sha256, Survey.format == parsed.format, Survey.frame == parsed.frame
     )
     same_samples = Survey.samples_sha256 == parsed.samples_sha256
-    same = select(Survey).where(Survey.floor_id == floor_id, or_(same_bytes, same_samples)).order_by(Survey.id)
+    same = select(Survey).where(Survey.floor_id == floor_id, or_(same_bytes, same_samples))
     staying = same.where(or_(Survey.id != replaces, same_samples)) if replaces else same
-    return session.scalars(staying.limit(1)).first()
+    return session.scalars(staying.order_by(Survey.samples_sha256 != parsed.samples_sha256, Survey.id).limit(1)).first()
 
 
 def _check_session(same: Survey, parsed: ParsedSurvey) -> None:

@@ -106,7 +106,8 @@ def _draw_colour_bar(
         bar.set_ticks([0.0, 1.0], labels=["not measured", "measured"])
         return
     bar = figure.colorbar(image, ax=axes, shrink=0.85, extend=_beyond(values, scale))
-    bar.set_label(f"{about.title} ({about.unit})" if about.unit else about.title)
+    name = about.short or about.title
+    bar.set_label(f"{name} ({about.unit})" if about.unit else name)
     if layer == "coverage":
         bar.locator = MaxNLocator(integer=True)
         bar.update_ticks()

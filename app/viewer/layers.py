@@ -43,6 +43,7 @@ class Layer:
     title: str
     unit: str
     colour_map: str = "viridis"
+    short: str = ""  # where the title is too long
 
 
 def _information_title(window: WindowModel) -> str:
@@ -66,8 +67,8 @@ LAYERS: dict[str, Layer] = {
     "gradient": Layer("Gradient along the floor", "µT/m"),
     "gradient_x": Layer("Gradient along x", "µT/m"),
     "gradient_y": Layer("Gradient along y", "µT/m"),
-    "information": Layer(_information_title(USUAL), "1/m²"),
-    "expected_error": Layer(_expected_error_title(USUAL), "m", "cividis"),
+    "information": Layer(_information_title(USUAL), "1/m²", short="Information"),
+    "expected_error": Layer(_expected_error_title(USUAL), "m", "cividis", "Expected error, rms"),
     "coverage": Layer("Coverage (surveys within 1 m)", "", "cividis"),
     "conflict": Layer("Conflict (errors of left-out surveys / their stated sd)", "", "magma"),
     "measured": Layer("Measured cells", "", "cividis"),

@@ -124,6 +124,10 @@ def test_an_upload_may_say_its_calibration_session(service: Any, new_floor: NewF
     other = upload(service, floor, data, session="robot-7 tuesday")
     assert other.status_code == 409
     assert f"replaces={survey['id']}" in other.json()["detail"]
+    twin = upload(service, floor, as_ndjson(data), format="ndjson", session="robot-7 tuesday")
+    assert twin.status_code == 202, "another offset, other samples"
+    assert upload(service, floor, data, session="robot-7 tuesday").json()["survey"] == twin.json()["survey"]
+    service.http.delete(f"/v1/surveys/{twin.json()['survey']['id']}")
     instead = upload(service, floor, data, session="robot-7 tuesday", replaces=survey["id"])
     assert instead.status_code == 202
     assert instead.json()["survey"]["session"] == "robot-7 tuesday"
