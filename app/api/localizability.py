@@ -1,6 +1,6 @@
 """How well windows will be located on a map, from the map alone."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
@@ -9,16 +9,15 @@ from app.api.auth import Reading
 from app.api.caching import immutable
 from app.api.context import ContextDep
 from app.api.maps import ready_map
-from app.api.models import Finite, Id, Metres
+from app.api.models import Id, Metres
 from app.api.problems import ERROR_RESPONSES
-from app.field.expected_error import UNKNOWN_HEADING_SD_RAD, WindowModel
+from app.api.windows import AskedWindowDep, Knowledge
 from app.services.summarise_localizability import JudgedPoint, LocalizabilitySummary, summarise_localizability
 from app.viewer.layers import nearest_height
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["maps"], responses=ERROR_RESPONSES)
-Knowledge = Literal["known", "unknown"]
 
 
 class PercentilesView(BaseModel):
@@ -72,33 +71,25 @@ def get_localizability(
     request: Request,
     context: ContextDep,
     identity: Reading,
-    window_m: Annotated[Finite, Query(ge=1.0, le=50.0, description="distance walked per window")] = 10.0,
-    noise_ut: Annotated[Finite, Query(ge=0.0, le=1000.0, description="white noise of one reading, per axis")] = 0.5,
-    bias: Annotated[Knowledge, Query(description="a constant offset of the sensor (unknown: demeaned)")] = "known",
-    heading: Annotated[Knowledge, Query(description="of the window's frame")] = "unknown",
-    height_m: Annotated[Metres | None, Query(description="the nearest of the map's heights is judged")] = None,
+    asked: AskedWindowDep,
+    height_m: Annotated[
+        Metres | None, Query(description="the nearest of the map's heights, within half a metre, is judged")
+    ] = None,
 ) -> Response:
     """Gradients of the field, and the least error (Cramer-Rao) of windows of this length and sensor.
 
-    The picture of it is the layer `expected_error` of the heat map. What it cannot tell: whether a place far away looks
-    alike; the answers of `locate` do.
+    The picture of it is the layer `expected_error` of the heat map, which takes the same parameters. What it
+    cannot tell: whether a place far away looks alike; the answers of `locate` do.
     """
     ready = ready_map(context, identity, map_id)
     grid, k = ready.grid, nearest_height(ready.grid, height_m)
-    window = WindowModel(
-        length_m=window_m,
-        noise_uT=noise_ut,
-        bias_sd_uT=0.0 if bias == "known" else float("inf"),
-        heading_sd_rad=0.0 if heading == "known" else UNKNOWN_HEADING_SD_RAD,
-    )
 
     def make() -> bytes:
-        summary = summarise_localizability(grid, k, window)
-        asked = {"window_m": window_m, "noise_ut": noise_ut, "bias": bias, "heading": heading}
-        told = {"map_sha256": ready.sha256, "components": list(grid.component_names), **asked, **_shown(summary)}
-        return LocalizabilityView.model_validate(told).model_dump_json().encode()
+        summary = summarise_localizability(grid, k, asked.model())
+        told = {"map_sha256": ready.sha256, "components": list(grid.component_names)}
+        return LocalizabilityView.model_validate(told | asked._asdict() | _shown(summary)).model_dump_json().encode()
 
-    tag = ready.tag("localizability", window_m, noise_ut, bias, heading, k)
+    tag = ready.tag("localizability", *asked, k)
     return immutable(request, tag, make, "application/json")
 
 

@@ -22,13 +22,15 @@ from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Metres, Point, RequestModel
 from app.api.problems import ERROR_RESPONSES
+from app.api.windows import AskedWindowDep
 from app.db.tables import Floor, Map, Survey
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
 from app.field.grid import FieldGrid
 from app.field.kernels import base_kernel, is_sum
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
-from app.field.spec import Kernel, Noise
+from app.field.spec import Kernel, MapSpec, Noise
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
+from app.services.exact_limit import TOO_MANY, outgrow_exact
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
 
@@ -89,6 +91,13 @@ class MapView(BaseModel):
     floor_id: str
     engine: str
     components: Components | None
+    kernel: Annotated[Kernel, Field(description="of the prior; what was asked for, or the default")]
+    curl_free: bool
+    heights_m: Annotated[list[float] | None, Field(description="as asked; null: one layer at the samples' median")]
+    noise: Annotated[Noise, Field(description="engines exact and compromise know white noise only, whatever this says")]
+    hard_iron: bool
+    robust: bool
+    refine: bool
     status: Literal["accepted", "running", "ready", "failed", "dismissed"]
     active: bool
     created_at: datetime
@@ -127,11 +136,13 @@ class FieldAnswer(BaseModel):
 
 
 def show_map(row: Map, active_map_id: str | None) -> MapView:
+    asked = MapSpec(**row.spec)
+    same = ("engine", "curl_free", "heights_m", "noise", "hard_iron", "robust", "refine", "resolution_m")
     return MapView.model_validate(
         {
-            "engine": row.spec.get("engine", "hilbert"), "active": row.id == active_map_id, "sha256": row.grid_sha256,
-            "resolution_m": row.spec.get("resolution_m", 0.25),
+            "active": row.id == active_map_id, "sha256": row.grid_sha256, "kernel": asked.covariance,
             "components": row.components or row.spec.get("components"),
+            **{name: getattr(asked, name) for name in same},
             **{name: getattr(row, name) for name in
                ("id", "floor_id", "status", "created_at", "bounds_m", "hyperparameters", "score", "score_reason",
                 "survey_ids")},
@@ -187,6 +198,16 @@ def _check_surveys(session: Session, floor_id: str, body: NewMap) -> list[str]:
     return sorted(row.id for row in rows)
 
 
+def _check_engine(session: Session, context: Context, row: Map) -> None:
+    """Refuse surveys that hold more than the engine takes."""
+    if row.spec["engine"] != "exact":
+        return
+    stored = session.scalars(select(Survey.samples_sha256).where(Survey.id.in_(row.survey_ids))).all()
+    if outgrow_exact(samples_from_bytes(context.blobs.get(sha256)) for sha256 in stored):
+        reason = f"{TOO_MANY}: use engine compromise or hilbert, or name fewer survey_ids"
+        raise InvalidInput(reason, Fault("/body/engine", reason))
+
+
 @router.post("/floors/{floor_id}/maps", status_code=202, response_model=NewMapAnswer, summary="Build a map")
 def create_map(
     floor_id: Id, body: NewMap, request: Request, context: ContextDep, identity: MapWriting, key: IdempotencyKey = None
@@ -205,6 +226,7 @@ def create_map(
             spec=body.model_dump(exclude={"survey_ids", "activate"}, exclude_none=True),
             survey_ids=_check_surveys(session, floor.id, body),
         )
+        _check_engine(session, context, row)
         session.add(row)
         session.flush()
         job = context.queue.enqueue_build(session, row)
@@ -290,14 +312,18 @@ def get_export(
     identity: Reading,
     format: Annotated[ExportFormat, Query()],
     gradient: Annotated[bool, Query(description="also the derivatives with x and y (z where the map knows it)")] = True,
+    localizability: Annotated[
+        bool, Query(description="also gradient norms, information and expected error (10 m window, 0.5 uT noise)")
+    ] = False,
 ) -> Response:
     """Mean, standard deviation, gradient and the layers of the fit, at every height; unmeasured cells are missing."""
     ready = ready_map(context, identity, map_id)
 
     def file() -> bytes:
-        return export_map(ready.grid, format, ready.sha256, ready.stored_layers(context), gradient)
+        return export_map(ready.grid, format, ready.sha256, ready.stored_layers(context), gradient, localizability)
 
-    response = immutable(request, ready.tag(format, f"gradient={gradient}"), file, MEDIA_TYPES[format])
+    tag = ready.tag(format, f"gradient={gradient}", *["localizability"] * localizability)
+    response = immutable(request, tag, file, MEDIA_TYPES[format])
     name = f"isodyn-{ready.sha256[:12]}.{EXTENSIONS[format]}"
     response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
     return response
@@ -314,19 +340,27 @@ def get_heatmap(
     request: Request,
     context: ContextDep,
     identity: Reading,
-    layer: Annotated[str, Query(max_length=40, examples=["norm", "bx", "sd", "gradient"])] = "norm",
-    height_m: Annotated[Metres | None, Query(description="the nearest of the map's heights is shown")] = None,
+    asked: AskedWindowDep,
+    layer: Annotated[str, Query(max_length=40, examples=["norm", "bx", "sd", "expected_error"])] = "norm",
+    height_m: Annotated[
+        Metres | None, Query(description="the nearest of the map's heights, within half a metre, is shown")
+    ] = None,
 ) -> Response:
-    """A map's layers follow from its components; an answer to a wrong name lists them."""
+    """A map's layers follow from its components; an answer to a wrong name lists them.
+
+    Window and sensor are those of the layer `expected_error`; `information` takes `noise_ut`; no other takes any.
+    """
     from app.viewer.heatmap import heatmap_png  # matplotlib takes half a second to load, and few calls need it
 
     ready = ready_map(context, identity, map_id)
     stored = ready.stored_layers(context)
     check_layer(ready.grid, layer, stored)
-    k = nearest_height(ready.grid, height_m)
-    return immutable(
-        request, ready.tag(layer, k), lambda: heatmap_png(ready.grid, layer, height_index=k, stored=stored), "image/png"
-    )
+    used, k = asked.of_layer(request, layer), nearest_height(ready.grid, height_m)
+
+    def picture() -> bytes:
+        return heatmap_png(ready.grid, layer, height_index=k, stored=stored, window=asked.model())
+
+    return immutable(request, ready.tag(layer, k, *used), picture, "image/png")
 
 
 @router.get(

@@ -19,12 +19,12 @@ from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Id, Name, RequestModel
 from app.api.problems import ERROR_RESPONSES
-from app.db.tables import Floor, Map, Survey
+from app.db.tables import Floor, Job, Map, Survey
 from app.errors import NotFound
-from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency
+from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency, WalkLocalizability
 from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
-from app.services.receive_survey import parse_survey, record_survey
+from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
 
 __all__ = ["SurveyView", "router"]
 
@@ -47,6 +47,15 @@ _FILES: dict[str, Any] = {
 }
 
 
+_JOB_LINK: dict[str, Any] = {
+    "Link": {
+        "description": "the rebuild it set off (RFC 8288, relation `monitor`); none when there is none",
+        "schema": {"type": "string"},
+        "example": '</v1/jobs/0197c1a2-0b7e-7c3d-9a52-5f0e8d6b4c21>; rel="monitor"',
+    }
+}
+
+
 class SurveyView(BaseModel):
     id: str
     floor_id: str
@@ -57,6 +66,8 @@ class SurveyView(BaseModel):
     included: bool
     sha256: Annotated[str, Field(description="of the uploaded bytes")]
     created_at: datetime
+    session: Annotated[str | None, Field(description="the sensor's calibration session, where it is known")] = None
+    replaces: Annotated[str | None, Field(description="the survey whose place it took")] = None
 
 
 class ReceivedSurvey(BaseModel):
@@ -70,6 +81,10 @@ class SurveyPatch(RequestModel):
     included: Annotated[bool, Field(description="false leaves the survey out of maps built from now on")]
 
 
+class PatchedSurvey(SurveyView):
+    job: Annotated[JobView | None, Field(description="the rebuild it set off; null when there is none")]
+
+
 class SurveySamples(BaseModel):
     """Samples as the map sees them, evenly thinned to `limit`; columns by name."""
 
@@ -81,7 +96,8 @@ class SurveySamples(BaseModel):
 
 def show_survey(row: Survey) -> SurveyView:
     names = ("id", "floor_id", "name", "format", "frame", "sample_count", "included", "created_at")
-    return SurveyView(sha256=row.raw_sha256, **{name: getattr(row, name) for name in names})
+    told = {name: row.report.get(name) for name in ("session", "replaces")} | {"sha256": row.raw_sha256}
+    return SurveyView.model_validate(told | {name: getattr(row, name) for name in names})
 
 
 def _find_survey(session: Session, identity: Identity, survey_id: str) -> Survey:
@@ -103,7 +119,7 @@ def _lock_survey(session: Session, identity: Identity, survey_id: str) -> Survey
     "/floors/{floor_id}/surveys",
     status_code=202,
     response_model=ReceivedSurvey,
-    responses={200: {"model": ReceivedSurvey, "description": "The same bytes were uploaded before"}},
+    responses={200: {"model": ReceivedSurvey, "description": "The same bytes, or equal samples, were uploaded before"}},
     openapi_extra={"requestBody": _FILES},
     summary="Upload a survey",
 )
@@ -117,21 +133,43 @@ async def upload_survey(
         Literal["building", "level", "norm"], Query(description="what b is when there is no quaternion")
     ] = "building",
     name: Annotated[Name | None, Query()] = None,
+    session: Annotated[
+        Name | None,
+        Query(
+            description="label of the sensor's calibration session: surveys that share it share one hard-iron offset; "
+            "for tables with qw,qx,qy,qz (a trace says its own)",
+            examples=["robot-7 2026-03-02"],
+        ),
+    ] = None,
+    replaces: Annotated[
+        str | None,
+        Query(
+            max_length=64,
+            pattern=r"^[A-Za-z0-9_-]+$",
+            description="a survey of this floor whose place it takes",
+            examples=["0197c1a2-0b7e-7c3d-9a52-5f0e8d6b4c21"],
+        ),
+    ] = None,
     key: IdempotencyKey = None,
 ) -> Response:
     """The body is the file; `Content-Encoding: gzip` or `zstd` is understood. It is parsed now and refused with line
-    and reason if it cannot be read; once accepted it is on disk, and a job maps it."""
-    elevation_m = await run_in_threadpool(_elevation_m, context, identity, floor_id)
+    and reason if it cannot be read; once accepted it is on disk, and a job maps it.
+
+    The answer 200 gives the survey that is there already, as it is: one left out of maps stays so, and has no job.
+    With `replaces` the old survey is deleted and the new one recorded in one step, and mapped by one job.
+    """
+    elevation_m = await run_in_threadpool(_elevation_m, context, identity, floor_id, replaces)
     data = await read_upload(request, context.settings.max_upload_bytes)
 
     def receive() -> Response:
         parsed = parse_survey(
-            context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=elevation_m
-        )
+            context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=elevation_m,
+            session=session,
+        )  # fmt: skip
 
-        def create(session: Session) -> tuple[int, BaseModel]:
-            floor = find_floor(session, identity, floor_id)
-            survey, job, new = record_survey(session, context.queue, floor, parsed)
+        def create(transaction: Session) -> tuple[int, BaseModel]:
+            floor = find_floor(transaction, identity, floor_id)
+            survey, job, new = record_survey(transaction, context.queue, floor, parsed, replaces)
             view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
             return 202 if new else 200, view
 
@@ -140,9 +178,13 @@ async def upload_survey(
     return await run_in_threadpool(receive)
 
 
-def _elevation_m(context: Context, identity: Identity, floor_id: str) -> float:
+def _elevation_m(context: Context, identity: Identity, floor_id: str, replaces: str | None) -> float:
+    """Of the floor; raises NotFound and InvalidInput before anything is stored."""
     with context.transaction() as session:
-        return find_floor(session, identity, floor_id).elevation_m
+        floor = find_floor(session, identity, floor_id)
+        if replaces is not None and not was_replaced(session, floor, replaces):
+            find_replaced(session, floor, replaces)
+        return floor.elevation_m
 
 
 @router.get("/floors/{floor_id}/surveys", summary="List a floor's surveys")
@@ -180,6 +222,9 @@ class ConsistencyView(BaseModel):
     reason: str | None
     change_point: Annotated[
         ChangePoint | None, Field(description="where in the log errors changed; null when nowhere clearly")
+    ] = None
+    localizability: Annotated[
+        WalkLocalizability | None, Field(description="Kuevor's GLM (B30); null when too few samples can be judged")
     ] = None
 
 
@@ -227,34 +272,39 @@ def get_samples(
 
 
 @router.patch("/surveys/{survey_id}", summary="Leave a survey out of maps, or take it in again")
-def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> SurveyView:
+def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> PatchedSurvey:
     with context.transaction() as session:
         survey = _lock_survey(session, identity, survey_id)
         changed, survey.included = survey.included != body.included, body.included
         session.flush()
-        if changed:
-            _rebuild(session, context, survey.floor_id)
-        return show_survey(survey)
+        job = _rebuild(session, context, survey.floor_id) if changed else None
+        return PatchedSurvey(**show_survey(survey).model_dump(), job=show_job(job) if job else None)
 
 
-@router.delete("/surveys/{survey_id}", status_code=204, summary="Delete a survey")
+@router.delete(
+    "/surveys/{survey_id}", status_code=204, responses={204: {"headers": _JOB_LINK}}, summary="Delete a survey"
+)
 def delete_survey(survey_id: Id, context: ContextDep, identity: SurveyWriting) -> Response:
-    """Maps already built keep what they learned from it; the next build does not have it."""
+    """Maps already built keep what they learned from it; the next build does not have it.
+
+    The header `Link` names the job of the rebuild that it set off, when there is one.
+    """
     with context.transaction() as session:
         survey = _lock_survey(session, identity, survey_id)
         floor_id = survey.floor_id
         session.delete(survey)
         session.flush()
-        _rebuild(session, context, floor_id)
-    return Response(status_code=204)
+        job = _rebuild(session, context, floor_id)
+        headers = {"Link": f'</v1/jobs/{job.id}>; rel="monitor"'} if job else {}
+    return Response(status_code=204, headers=headers)
 
 
-def _rebuild(session: Session, context: Context, floor_id: str) -> None:
+def _rebuild(session: Session, context: Context, floor_id: str) -> Job | None:
     """Set off a rebuild if the floor builds by itself; with nothing left to build from it has no map any more."""
     floor = session.get_one(Floor, floor_id)
     if not floor.auto_build:
-        return
+        return None
     if session.scalars(select(Survey.id).where(Survey.floor_id == floor_id, Survey.included).limit(1)).first():
-        context.queue.enqueue_rebuild(session, floor)
-    else:
-        floor.active_map_id, floor.active_sequence = None, floor.build_sequence
+        return context.queue.enqueue_rebuild(session, floor)
+    floor.active_map_id, floor.active_sequence = None, floor.build_sequence
+    return None

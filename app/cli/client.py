@@ -49,6 +49,9 @@ def ingest(
     url: Url = DEFAULT_URL,
     format: Annotated[str | None, typer.Option(help="default: by the file's ending")] = None,
     frame: Annotated[str, typer.Option(help="building, level or norm")] = "building",
+    session: Annotated[
+        str | None, typer.Option(help="label of the sensor's calibration session, for files with quaternions")
+    ] = None,
     wait: Annotated[bool, typer.Option(help="wait until the map is built")] = True,
 ) -> None:
     """Upload surveys to a floor, and wait for its map."""
@@ -65,7 +68,7 @@ def ingest(
             answer = api.call(
                 "POST",
                 f"/v1/floors/{floor_id}/surveys",
-                params={"format": kind, "frame": frame, "name": file.name},
+                params={"format": kind, "frame": frame, "name": file.name} | ({"session": session} if session else {}),
                 headers={"Content-Encoding": "gzip"},
                 content=file.read_bytes() if packed else gzip.compress(file.read_bytes()),
             ).json()
@@ -100,9 +103,11 @@ def export(
     key: KeyOption,
     url: Url = DEFAULT_URL,
     format: Annotated[str, typer.Option(help="netcdf, zarr, npz, covjson or csv")] = "netcdf",
+    localizability: Annotated[bool, typer.Option(help="also gradient norms, information, expected error")] = False,
 ) -> None:
     """Write a map as a file for other tools."""
-    answer = Api(url, key).call("GET", f"/v1/maps/{map_id}/export", params={"format": format})
+    asked = {"format": format, "localizability": localizability}
+    answer = Api(url, key).call("GET", f"/v1/maps/{map_id}/export", params=asked)
     output.write_bytes(answer.content)
     print(f"{output}: {len(answer.content):,} bytes")
 

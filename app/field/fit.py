@@ -25,6 +25,7 @@ from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import Engine, FittedMap, MapSpec, Progress
 from app.field.tally import held_out_errors
 from app.field.tile_fit import FitState
+from app.field.walk_localizability import add_localizability
 from app.geometry import Array
 
 __all__ = ["fit_map"]
@@ -84,13 +85,15 @@ def fit_map(
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
     names, frame = COMPONENT_NAMES[spec.components], estimate.frame
+    grid = _grid(observed, estimate, spec, noise_sd_uT, correlation_m)
+    reports = check_surveys(held_out, names, correlation_m)
     about_labels = {"refinement": refinement.as_json()} if refinement else {}
     return FittedMap(
-        grid=_grid(observed, estimate, spec, noise_sd_uT, correlation_m),
+        grid=grid,
         hyperparameters={"engine": spec.engine} | estimate.hyperparameters | about_labels,
         score=scored,
         score_reason=None if scored else _score_reason(observed),
-        consistency=check_surveys(held_out, names, correlation_m),
+        consistency=add_localizability(reports, cleaned.walks, held_out, grid),
         layers=quality_layers(frame.x_m, frame.y_m, frame.heights_m, observed, held_out),
         out_of_date=out_of_date_regions(observed, held_out, sorted(walks), names, correlation_m),
         state=None if spec.refine else estimate.state,

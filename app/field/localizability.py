@@ -9,8 +9,8 @@ from app.field.grid import FieldGrid
 from app.geometry import Array
 
 __all__ = [
-    "GLM_STEP_M", "Extreme", "GlmSeries", "GradientNorms", "best_and_worst_points", "glm", "glm_average",
-    "glm_ratio_of_means", "gradient_norms",
+    "GLM_STEP_M", "Extreme", "GlmSeries", "GradientNorms", "at_two_hertz", "best_and_worst_points", "glm",
+    "glm_average", "glm_ratio_of_means", "glm_series", "gradient_norms",
 ]  # fmt: skip
 
 GLM_STEP_M = 0.05
@@ -71,8 +71,12 @@ def glm(
 
     gradient_uT_per_m (n, c, 2 or 3) of the map, and error_uT (n, c) map minus measurement, both at the true positions.
     """
-    signal = step_m * gradient_norms(gradient_uT_per_m).total
-    noise = np.linalg.norm(error_uT, axis=1)
+    return glm_series(step_m * gradient_norms(gradient_uT_per_m).total, error_uT, window=window)
+
+
+def glm_series(signal_uT: Array, error_uT: Array, *, window: int = GLM_WINDOW) -> GlmSeries:
+    """The same from the signal (n,): gradient times step."""
+    signal, noise = signal_uT, np.linalg.norm(error_uT, axis=1)
     ratio = np.full(len(signal), np.nan)
     if len(signal) >= window:
         box = np.ones(window)
@@ -82,17 +86,17 @@ def glm(
 
 def glm_average(t_s: Array, series: GlmSeries) -> float:
     """GLM_avg: mean of signal / noise over samples at 2 Hz (Kuevor B30, eq. 4.16); one small noise can dominate it."""
-    at = _at_two_hertz(t_s)
+    at = at_two_hertz(t_s)
     return float(np.mean(_ratio(series.signal_uT[at], series.noise_uT[at])))
 
 
 def glm_ratio_of_means(t_s: Array, series: GlmSeries) -> float:
     """Mean signal over mean noise of the same samples: what GLM_avg means, without its weakness (Kuevor, 4.28)."""
-    at = _at_two_hertz(t_s)
+    at = at_two_hertz(t_s)
     return float(_ratio(series.signal_uT[at].mean(), series.noise_uT[at].mean()))
 
 
-def _at_two_hertz(t_s: Array) -> NDArray[np.int64]:
+def at_two_hertz(t_s: Array) -> NDArray[np.int64]:
     """Indices of the first sample at or after every half second."""
     wanted = np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _GLM_RATE_HZ)
     return np.unique(np.minimum(np.searchsorted(t_s, wanted - 1e-9), len(t_s) - 1))

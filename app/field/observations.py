@@ -16,7 +16,7 @@ from app.errors import InvalidInput
 from app.field.samples import Components, Samples
 from app.geometry import Array
 
-__all__ = ["STRETCH_M", "Walk", "observe", "walk_bounds"]
+__all__ = ["STRETCH_M", "Walk", "count_observations", "observe", "walk_bounds"]
 
 STRETCH_M = 0.2
 MIN_OBSERVATIONS = 8
@@ -59,6 +59,11 @@ def observe(walks: Mapping[str, Samples], components: Components, stretch_m: flo
             f"{MIN_OBSERVATIONS}: upload longer walks"
         )
     return observed
+
+
+def count_observations(samples: Samples, stretch_m: float = STRETCH_M) -> int:
+    """How many observations a walk becomes."""
+    return len(_stretch_starts(samples.p_building_m, stretch_m)) if len(samples) else 0
 
 
 def walk_bounds(walks: Sequence[Walk]) -> list[int]:

@@ -30,6 +30,7 @@ __all__ = [
     "Progress",
     "Score",
     "SegmentConsistency",
+    "WalkLocalizability",
 ]
 
 Engine = Literal["hilbert", "exact", "compromise"]
@@ -146,6 +147,24 @@ class ChangePoint:
 
 
 @dataclass(frozen=True, slots=True)
+class WalkLocalizability:
+    """Kuevor's gradient localization metric (B30) of one survey, on its judged samples.
+
+    Signal is the map's gradient times `step_m`, noise the length of the error of the map of the others at the true
+    position; means are of samples at 2 Hz, percentiles of the ratio over five samples. A ratio to no noise is None.
+    """
+
+    step_m: float
+    mean_signal_ut: float
+    mean_noise_ut: float
+    glm_average: float | None
+    glm_ratio_of_means: float | None
+    glm_p5: float | None
+    glm_p50: float | None
+    glm_p95: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class ConsistencyReport:
     """The consistency of one survey with the map of *the other* surveys (Kuevor B14), whole and in segments.
 
@@ -160,6 +179,7 @@ class ConsistencyReport:
     segments: tuple[SegmentConsistency, ...] = ()
     reason: str | None = None
     change_point: ChangePoint | None = None
+    localizability: WalkLocalizability | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,11 @@ from app.blobs import BlobStore
 from app.db.tables import REBUILD, Floor, Job, Map, Survey
 from app.errors import CorruptArtefact, InvalidInput, NotFound
 from app.field.fit import fit_map
-from app.field.samples import SampleFrame, richest_components
+from app.field.samples import SampleFrame, Samples, richest_components
 from app.field.spec import FittedMap, MapSpec
 from app.field.tile_fit import FitState
 from app.services.artefacts import grid_to_bytes, layers_to_bytes, samples_from_bytes
+from app.services.exact_limit import TOO_MANY, outgrow_exact
 from app.services.fit_state import state_from_bytes, state_to_bytes
 
 __all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "publish_build"]
@@ -60,6 +61,7 @@ def claim_build(session: Session, job_id: str) -> Plan:
         "floor_id": job.floor_id,
         "sequence": map_row.sequence,
         "spec": map_row.spec,
+        "rebuild": job.kind == REBUILD,
         "surveys": sorted([row.id, row.samples_sha256, row.frame] for row in surveys),
         **_earlier_states(session, job, map_row),
     }
@@ -90,6 +92,7 @@ def _earlier_states(session: Session, job: Job, map_row: Map) -> Plan:
 def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
     """Fit the map of a plan and store its grid, layers and quality reports as blobs. No database; may take minutes.
 
+    A rebuild of what has outgrown engine `exact` is by the default engine; a build that was asked for is as asked.
     Raises InvalidInput (nothing to fit, frames that cannot give the components asked for), JobCancelled (through
     `progress`).
     """
@@ -98,7 +101,9 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
         raise InvalidInput("the floor has no included survey left to build a map from; upload or include one")
     progress(0.0, f"reading {len(surveys)} surveys")
     walks = {survey_id: samples_from_bytes(blobs.get(sha)) for survey_id, sha, _ in surveys}
-    parameters = dict(plan["spec"])
+    fallback = _fallback(plan, walks)
+    spec = {name: value for name, value in plan["spec"].items() if name != "engine"} if fallback else plan["spec"]
+    parameters = dict(spec)
     parameters.setdefault("components", richest_components({frame for _, _, frame in surveys}))
     if parameters.get("heights_m"):
         parameters["heights_m"] = tuple(parameters["heights_m"])
@@ -110,10 +115,11 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
     for sha256 in plan.get("stale_states", []):
         blobs.discard(sha256)
     state = state_to_bytes(fitted.state) if fitted.state else None
-    changes = _changes(plan, fitted)
+    changes = _changes(plan, fitted) | {"fallback": fallback}
     return {
         "state_sha256": blobs.put(state) if state else None,
         "changes": changes,
+        "spec": spec,
         "grid_sha256": blobs.put(grid_to_bytes(fitted.grid)),
         "layers_sha256": blobs.put(layers_to_bytes(fitted.layers)) if fitted.layers else None,
         "quality_sha256": blobs.put(_quality_bytes(fitted, changes)),
@@ -123,6 +129,13 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
         "score": asdict(fitted.score) if fitted.score else None,
         "score_reason": fitted.score_reason,
     }
+
+
+def _fallback(plan: Plan, walks: Mapping[str, Samples]) -> str | None:
+    """Why a rebuild cannot be by the engine that was asked for."""
+    if plan["spec"].get("engine") != "exact" or not plan.get("rebuild") or not outgrow_exact(walks.values()):
+        return None
+    return f"{TOO_MANY}: built by engine {MapSpec().engine}, as will be what follows"
 
 
 def _previous_state(plan: Plan, components: str, blobs: BlobStore) -> FitState | None:
@@ -157,16 +170,19 @@ def publish_build(session: Session, job_id: str, plan: Plan, result: Result) -> 
         setattr(map_row, name, result[name])
     for name in ("layers_sha256", "state_sha256"):  # not every fit has them
         setattr(map_row, name, result.get(name))
+    map_row.spec = result.get("spec", map_row.spec)
     map_row.status, map_row.finished_at = "ready", datetime.now(UTC)
     floor = session.get_one(Floor, plan["floor_id"], with_for_update=True)
     if map_row.activate and floor.active_sequence < plan["sequence"]:
         floor.active_map_id, floor.active_sequence = map_row.id, plan["sequence"]
     activated = floor.active_map_id == map_row.id
     overtaken = "; a newer map, or one chosen by hand, stays active" if map_row.activate else ""
-    _end(job, "successful", "the map is ready" + (" and active" if activated else overtaken))
+    changes = result.get("changes") or {}
+    fallback = f"; {changes['fallback']}" if changes.get("fallback") else ""
+    _end(job, "successful", "the map is ready" + (" and active" if activated else overtaken) + fallback)
     job.progress = 100
     job.result = {
-        "map_id": map_row.id, "sha256": map_row.grid_sha256, "activated": activated, "changes": result.get("changes"),
+        "map_id": map_row.id, "sha256": map_row.grid_sha256, "activated": activated, "changes": changes,
     }  # fmt: skip
 
 

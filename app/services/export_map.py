@@ -47,13 +47,15 @@ def export_map(
     map_id: str,
     layers: Mapping[str, NDArray[np.floating]] = NOTHING,
     gradient: bool = True,
+    localizability: bool = False,
 ) -> bytes:
-    """A map in one of the formats: mean, standard deviation, slopes (if `gradient`) and further `layers` (nz, ny, nx).
+    """A map in one of the formats: mean, standard deviation, slopes (if `gradient`) and further `layers` (nz, ny, nx);
+    if `localizability`, gradient norms, information and the expected error of a usual window too.
 
     `map_id` names the map for ever (its SHA-256), in the formats that have a place for it.
     """
     write = {"netcdf": _netcdf, "zarr": _zarr, "npz": _npz, "covjson": _covjson, "csv": _csv}[format]
-    return write(map_dataset(grid, map_id, layers, gradient))
+    return write(map_dataset(grid, map_id, layers, gradient, localizability))
 
 
 def _npz(dataset: MapDataset) -> bytes:
@@ -166,7 +168,7 @@ def _covjson_domain(dataset: MapDataset) -> dict[str, Any]:
 
 
 def _covjson_parameter(variable: Variable) -> dict[str, Any]:
-    code = {"uT": "uT", "uT m-1": "uT/m", "1": "1"}[variable.attributes["units"]]
+    code = {"uT": "uT", "uT m-1": "uT/m", "m": "m", "m-2": "m-2", "1": "1"}[variable.attributes["units"]]
     return {
         "type": "Parameter",
         "observedProperty": {"label": {"en": variable.attributes["long_name"]}},

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.field.expected_error import WindowModel, expected_error_m, point_information
 from app.field.grid import FieldGrid
+from app.field.localizability import gradient_norms
 
 __all__ = ["AXES", "MapDataset", "Variable", "map_dataset"]
 
@@ -45,7 +47,8 @@ class Variable:
 @dataclass(frozen=True, slots=True, eq=False)
 class MapDataset:
     """variables: z, y, x (n,) float64 and their bounds; measured (nz, ny, nx) int8; data (nz, ny, nx) float32, NaN
-    where nothing was measured: per component the mean, its sd and, when asked for, its slopes; then further layers.
+    where nothing was measured: per component the mean, its sd and, when asked for, its slopes; then what tells places
+    apart, when asked for, and further layers.
     """
 
     attributes: dict[str, Any]
@@ -58,7 +61,11 @@ class MapDataset:
 
 
 def map_dataset(
-    grid: FieldGrid, map_id: str, layers: Mapping[str, NDArray[np.floating]] = NOTHING, gradient: bool = True
+    grid: FieldGrid,
+    map_id: str,
+    layers: Mapping[str, NDArray[np.floating]] = NOTHING,
+    gradient: bool = True,
+    localizability: bool = False,
 ) -> MapDataset:
     """The whole map. `map_id`: what names it for ever; `layers`: (nz, ny, nx) each, by name."""
     mask = {
@@ -70,6 +77,8 @@ def map_dataset(
     fields: dict[str, Variable] = {}
     for c, component in enumerate(grid.component_names):
         fields |= _component(grid, c, component, gradient)
+    if localizability:
+        fields |= _localizability(grid, WindowModel())
     for name, layer in layers.items():
         fields[name] = _on_cells(grid, layer, _LAYERS.get(name, name), "1", "measured")
     return MapDataset(_about(grid, map_id), _axes(grid) | mask | fields)
@@ -87,6 +96,23 @@ def _component(grid: FieldGrid, c: int, component: str, gradient: bool) -> dict[
         name, what = f"d{component}_d{'xyz'[axis]}_ut_per_m", f"derivative with {'xyz'[axis]} of {long_name}"
         found[name] = _on_cells(grid, slopes[..., axis], what, "uT m-1", "measured")
     return found
+
+
+def _localizability(grid: FieldGrid, window: WindowModel) -> dict[str, Variable]:
+    """How well places are told apart: norms of the gradient along the floor, and what they are worth to a window."""
+    norms = gradient_norms(grid.gradient_uT_per_m[..., :2])
+    layers = range(len(grid.heights_m))
+    information = np.stack([point_information(grid, k, window.noise_uT) for k in layers])
+    error_m = np.stack([expected_error_m(grid, k, window) for k in layers])
+    walked = f"of a straight window of {window.length_m:g} m that ends here, {window.noise_uT:g} uT of noise"
+    named = {
+        "gradient_ut_per_m": (norms.total, "norm of the gradient along the floor", "uT m-1"),
+        "gradient_x_ut_per_m": (norms.x, "norm of the derivative with x", "uT m-1"),
+        "gradient_y_ut_per_m": (norms.y, "norm of the derivative with y", "uT m-1"),
+        "information_per_m2": (information, f"information of one reading of {window.noise_uT:g} uT noise", "m-2"),
+        "expected_error_m": (error_m, f"least rms horizontal error {walked}, heading unknown, offset known", "m"),
+    }
+    return {name: _on_cells(grid, *about, "measured") for name, about in named.items()}
 
 
 def _on_cells(grid: FieldGrid, values: NDArray[Any], long_name: str, units: str, linked: str) -> Variable:

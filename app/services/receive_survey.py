@@ -7,18 +7,19 @@ worst a blob nobody names.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import and_, or_, select
 from sqlalchemy.orm import Session
 
 from app.blobs import BlobStore
 from app.db.tables import Floor, Job, Survey
+from app.errors import Conflict, Fault, InvalidInput, NotFound
 from app.field.samples import SampleFrame
 from app.jobs.queue import JobQueue, lock_floor
 from app.services.artefacts import samples_to_bytes
 from app.survey.read import read_survey
 from app.survey.walk import Walk
 
-__all__ = ["ParsedSurvey", "parse_survey", "record_survey"]
+__all__ = ["ParsedSurvey", "find_replaced", "parse_survey", "record_survey", "was_replaced"]
 
 DEVICE_HEIGHT_FORMATS = frozenset({"indoor-location-2020"})  # their z is height above the slab, not building z
 
@@ -34,13 +35,21 @@ class ParsedSurvey:
     samples_sha256: str
     sample_count: int
     report: dict[str, object]
+    session: str | None
 
 
 def parse_survey(
-    blobs: BlobStore, data: bytes, *, format: str, frame: SampleFrame, name: str, elevation_m: float
+    blobs: BlobStore,
+    data: bytes,
+    *,
+    format: str,
+    frame: SampleFrame,
+    name: str,
+    elevation_m: float,
+    session: str | None = None,
 ) -> ParsedSurvey:
     """Read a survey file and store its bytes and its samples. Raises UnreadableSurvey; then nothing is stored."""
-    walk = read_survey(data, format=format, frame=frame)
+    walk = read_survey(data, format=format, frame=frame, session=session)
     samples = _raise_to_floor(walk, elevation_m).samples if format in DEVICE_HEIGHT_FORMATS else walk.samples
     return ParsedSurvey(
         format=format,
@@ -50,28 +59,73 @@ def parse_survey(
         samples_sha256=blobs.put(samples_to_bytes(samples)),
         sample_count=len(samples),
         report=walk.report,
+        session=session,
     )
 
 
 def record_survey(
-    session: Session, queue: JobQueue, floor: Floor, parsed: ParsedSurvey
+    session: Session, queue: JobQueue, floor: Floor, parsed: ParsedSurvey, replaces: str | None = None
 ) -> tuple[Survey, Job | None, bool]:
     """The survey's row, the rebuild it set off (None when the floor does not build by itself), and whether it is new.
 
-    The same bytes in the same format and frame on the same floor are the same survey; `floor` is locked first, so
-    that two uploads at once agree on which came first.
+    The same bytes in the same format and frame, or equal samples, on the same floor are the same survey; `floor` is
+    locked first, so that two uploads at once agree on which came first. One left out of maps stays so, and has no job.
+    `replaces`: the survey that goes as this one comes; said again once done, it changes nothing.
+    Raises NotFound, InvalidInput (`find_replaced`), Conflict.
     """
     lock_floor(session, floor.id)
-    same = select(Survey).where(
-        Survey.floor_id == floor.id,
-        Survey.raw_sha256 == parsed.raw_sha256,
-        Survey.format == parsed.format,
-        Survey.frame == parsed.frame,
+    same = _same_survey(session, floor.id, parsed, replaces)
+    if same is not None and replaces in (None, same.id, same.report.get("replaces")):
+        _check_session(same, parsed)
+        return same, latest_job(session, floor.id) if same.included else None, False
+    old = find_replaced(session, floor, replaces) if replaces else None
+    if same is not None:
+        raise Conflict(f"these samples are survey {same.id} already; delete {replaces} instead of replacing it")
+    if old is not None:
+        session.delete(old)
+        session.flush()
+    survey = _new_survey(floor, parsed, replaces)
+    session.add(survey)
+    session.flush()
+    return survey, queue.enqueue_rebuild(session, floor) if floor.auto_build else None, True
+
+
+def find_replaced(session: Session, floor: Floor, survey_id: str) -> Survey:
+    """The survey to be replaced. Raises NotFound, or InvalidInput when it is of another floor."""
+    old = session.get(Survey, survey_id)
+    if old is None or old.organisation_id != floor.organisation_id:
+        raise NotFound(f"no survey {survey_id} to replace")
+    if old.floor_id != floor.id:
+        reason = f"survey {survey_id} is of another floor, {old.floor_id}"
+        raise InvalidInput(reason, Fault("/query/replaces", reason))
+    return old
+
+
+def was_replaced(session: Session, floor: Floor, survey_id: str) -> bool:
+    """Whether a survey of the floor took the place of this one."""
+    came = Survey.report["replaces"].as_string() == survey_id
+    return session.scalars(select(Survey.id).where(Survey.floor_id == floor.id, came).limit(1)).first() is not None
+
+
+def _same_survey(session: Session, floor_id: str, parsed: ParsedSurvey, replaces: str | None) -> Survey | None:
+    """The first survey of the same samples, else of the same bytes; one of other samples that is to go is none."""
+    same_bytes = and_(
+        Survey.raw_sha256 == parsed.raw_sha256, Survey.format == parsed.format, Survey.frame == parsed.frame
     )
-    existing = session.scalars(same).one_or_none()
-    if existing is not None:
-        return existing, latest_job(session, floor.id), False
-    survey = Survey(
+    same_samples = Survey.samples_sha256 == parsed.samples_sha256
+    same = select(Survey).where(Survey.floor_id == floor_id, or_(same_bytes, same_samples))
+    staying = same.where(or_(Survey.id != replaces, same_samples)) if replaces else same
+    return session.scalars(staying.order_by(Survey.samples_sha256 != parsed.samples_sha256, Survey.id).limit(1)).first()
+
+
+def _check_session(same: Survey, parsed: ParsedSurvey) -> None:
+    said, now = same.report.get("session"), parsed.session
+    if now not in (None, said):
+        raise Conflict(f"these bytes are survey {same.id} already, of session {said}; give replaces={same.id}")
+
+
+def _new_survey(floor: Floor, parsed: ParsedSurvey, replaces: str | None) -> Survey:
+    return Survey(
         organisation_id=floor.organisation_id,
         floor_id=floor.id,
         name=parsed.name,
@@ -80,11 +134,8 @@ def record_survey(
         raw_sha256=parsed.raw_sha256,
         samples_sha256=parsed.samples_sha256,
         sample_count=parsed.sample_count,
-        report=parsed.report,
+        report=parsed.report | {"replaces": replaces},
     )
-    session.add(survey)
-    session.flush()
-    return survey, queue.enqueue_rebuild(session, floor) if floor.auto_build else None, True
 
 
 def latest_job(session: Session, floor_id: str) -> Job | None:

@@ -1,6 +1,7 @@
 """Bytes of a survey file in, a walk out: the one entry to every format."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import get_args
 
 from app.errors import Fault, UnreadableSurvey
@@ -23,11 +24,12 @@ _TABLES: dict[str, Callable[[bytes, SampleFrame], Columns]] = {
 FORMATS = (*_TABLES, "indoor-location-2020")
 
 
-def read_survey(data: bytes, *, format: str, frame: SampleFrame = "building") -> Walk:
+def read_survey(data: bytes, *, format: str, frame: SampleFrame = "building", session: str | None = None) -> Walk:
     """Read one walk from the (decompressed) bytes of a survey file.
 
     format    one of `FORMATS`
     frame     what b is in a table without quaternions: "building", "level" or "norm"; traces find their own
+    session   label of the sensor's calibration session (Samples.session): tables with quaternions; traces have theirs
 
     Raises UnreadableSurvey with line, column and reason for anything that cannot be used, TooLarge beyond the most
     samples a survey may have (2,000,000). Nothing else.
@@ -41,12 +43,22 @@ def read_survey(data: bytes, *, format: str, frame: SampleFrame = "building") ->
             f"unknown frame {frame[:40]!r}; known are {', '.join(get_args(SampleFrame))}", Fault("frame", "unknown")
         )
     if format == "indoor-location-2020":
+        _refuse_session(session, "a trace says its calibration session itself, by the phone's own bias")
         return read_indoor_location(data)
     samples, assumptions = samples_from_columns(_TABLES[format](data, frame), frame)
+    if samples.q_body_to_building is None:
+        _refuse_session(session, "a sensor's offset is known in its own frame only: give qw,qx,qy,qz and b in it")
+    samples = replace(samples, session=session)
     report: dict[str, object] = {
         "format": format,
+        "session": session,
         **describe_samples(samples),
         "assumptions": assumptions,
         "warnings": sample_warnings(samples),
     }
     return Walk(samples, report)
+
+
+def _refuse_session(session: str | None, reason: str) -> None:
+    if session is not None:
+        raise UnreadableSurvey(f"session cannot be said of this survey: {reason}", Fault("session", reason))

@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from app.field.expected_error import WindowModel
 from app.field.grid import FieldGrid
 from app.geometry import Array
-from app.viewer.layers import LAYERS, NONE_STORED, ColourScale, StoredLayers, colour_scale, layer_values
+from app.viewer.layers import (
+    NONE_STORED,
+    USUAL,
+    ColourScale,
+    Layer,
+    StoredLayers,
+    about_layer,
+    colour_scale,
+    layer_values,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,9 +39,12 @@ def heatmap_png(
     title: str | None = None,
     height_index: int = 0,
     stored: StoredLayers = NONE_STORED,
+    window: WindowModel = USUAL,
 ) -> bytes:
     """A PNG of one layer at one height. Unmeasured cells are blank, measured cells of which the layer knows nothing
-    are grey; the same grid, layer and title give the same bytes.
+    are grey; the same grid, layer, title and window give the same bytes.
+
+    `window`: what the layers expected_error and information are for.
 
     Raises InvalidInput, naming the layers this map has, for a layer it does not have.
     """
@@ -40,15 +53,16 @@ def heatmap_png(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    values = layer_values(grid, layer, height_index, stored)
+    values = layer_values(grid, layer, height_index, stored, window)
+    about = about_layer(layer, window)
     figure = Figure(figsize=_size_inches(values.shape), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     scale = colour_scale(layer, [values])
     image = _draw_cells(axes, grid, values, scale, height_index)
-    _draw_colour_bar(figure, axes, image, layer, values, scale)
+    _draw_colour_bar(figure, axes, image, layer, about, values, scale)
     _draw_scale_bar(figure, axes)
-    text = title or f"{LAYERS[layer].title}, z = {grid.heights_m[height_index]:.2f} m"
+    text = title or f"{about.title}, z = {grid.heights_m[height_index]:.2f} m"
     unknown = bool(np.any(grid.measured[height_index] & np.isnan(values)))
     axes.set_title(text + ("\n(grey: measured, but too little to tell)" if unknown else ""), fontsize=11, wrap=True)
     buffer = io.BytesIO()
@@ -83,7 +97,7 @@ def _draw_cells(axes: Axes, grid: FieldGrid, values: Array, scale: ColourScale, 
 
 
 def _draw_colour_bar(
-    figure: Figure, axes: Axes, image: AxesImage, layer: str, values: Array, scale: ColourScale
+    figure: Figure, axes: Axes, image: AxesImage, layer: str, about: Layer, values: Array, scale: ColourScale
 ) -> None:
     from matplotlib.ticker import MaxNLocator
 
@@ -92,8 +106,8 @@ def _draw_colour_bar(
         bar.set_ticks([0.0, 1.0], labels=["not measured", "measured"])
         return
     bar = figure.colorbar(image, ax=axes, shrink=0.85, extend=_beyond(values, scale))
-    about = LAYERS[layer]
-    bar.set_label(f"{about.title} ({about.unit})" if about.unit else about.title)
+    name = about.short or about.title
+    bar.set_label(f"{name} ({about.unit})" if about.unit else name)
     if layer == "coverage":
         bar.locator = MaxNLocator(integer=True)
         bar.update_ticks()

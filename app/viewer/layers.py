@@ -1,14 +1,14 @@
 """Layers of a map as arrays and colours: one layer at one height, with its unit and a colour-blind-safe colour map."""
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import InvalidInput
+from app.errors import Fault, InvalidInput
 from app.field.expected_error import WindowModel, expected_error_m, point_information
 from app.field.grid import FieldGrid
 from app.field.localizability import gradient_norms
@@ -21,6 +21,7 @@ __all__ = [
     "ColourScale",
     "Layer",
     "StoredLayers",
+    "about_layer",
     "check_layer",
     "colour_scale",
     "layer_names",
@@ -30,6 +31,8 @@ __all__ = [
 ]
 
 StoredLayers = Mapping[str, NDArray[np.floating]]  # (nz, ny, nx) by name, of one map
+FARTHEST_M = 0.5  # from the height asked for to the one shown
+USUAL = WindowModel()
 NONE_STORED: StoredLayers = MappingProxyType({})
 
 
@@ -40,6 +43,17 @@ class Layer:
     title: str
     unit: str
     colour_map: str = "viridis"
+    short: str = ""  # where the title is too long
+
+
+def _information_title(window: WindowModel) -> str:
+    return f"Information of one reading of {window.noise_uT:g} µT noise"
+
+
+def _expected_error_title(window: WindowModel) -> str:
+    offset = ", unknown offset" if window.bias_sd_uT > 0.0 else ""
+    heading = ", known heading" if window.heading_sd_rad == 0.0 else ""
+    return f"Expected error of a {window.length_m:g} m window, {window.noise_uT:g} µT noise{offset}{heading} (rms)"
 
 
 LAYERS: dict[str, Layer] = {
@@ -53,8 +67,8 @@ LAYERS: dict[str, Layer] = {
     "gradient": Layer("Gradient along the floor", "µT/m"),
     "gradient_x": Layer("Gradient along x", "µT/m"),
     "gradient_y": Layer("Gradient along y", "µT/m"),
-    "information": Layer("Information of one reading of 0.5 µT noise", "1/m²"),
-    "expected_error": Layer("Expected error of a 10 m window (rms)", "m", "cividis"),
+    "information": Layer(_information_title(USUAL), "1/m²", short="Information"),
+    "expected_error": Layer(_expected_error_title(USUAL), "m", "cividis", "Expected error, rms"),
     "coverage": Layer("Coverage (surveys within 1 m)", "", "cividis"),
     "conflict": Layer("Conflict (errors of left-out surveys / their stated sd)", "", "magma"),
     "measured": Layer("Measured cells", "", "cividis"),
@@ -70,8 +84,18 @@ def layer_names(components: Components, stored: Collection[str] = ()) -> tuple[s
 
 
 def nearest_height(grid: FieldGrid, height_m: float | None) -> int:
-    """The index of the map's height that is nearest to `height_m` (of two as near the lower; None: the lowest)."""
-    return 0 if height_m is None else int(np.argmin(np.abs(grid.heights_m - height_m)))
+    """The index of the map's height that is nearest to `height_m` (of two as near the lower; None: the lowest).
+
+    Raises InvalidInput, naming the heights there are, when none is within `FARTHEST_M`.
+    """
+    if height_m is None:
+        return 0
+    away_m = np.abs(grid.heights_m - height_m)
+    if away_m.min() > FARTHEST_M + 1e-9:
+        heights = ", ".join(f"{z:.2f}" for z in grid.heights_m)
+        reason = f"{height_m:g} m is farther than {FARTHEST_M:g} m from every height of this map: {heights} m"
+        raise InvalidInput(reason, Fault("/query/height_m", reason))
+    return int(np.argmin(away_m))
 
 
 def check_layer(grid: FieldGrid, layer: str, stored: Collection[str] = ()) -> None:
@@ -84,12 +108,24 @@ def check_layer(grid: FieldGrid, layer: str, stored: Collection[str] = ()) -> No
         )
 
 
-def layer_values(grid: FieldGrid, layer: str, height_index: int = 0, stored: StoredLayers = NONE_STORED) -> Array:
+def about_layer(layer: str, window: WindowModel = USUAL) -> Layer:
+    """The layer, named after the window and the sensor it is for."""
+    titles = {"information": _information_title, "expected_error": _expected_error_title}
+    return replace(LAYERS[layer], title=titles[layer](window)) if layer in titles else LAYERS[layer]
+
+
+def layer_values(
+    grid: FieldGrid,
+    layer: str,
+    height_index: int = 0,
+    stored: StoredLayers = NONE_STORED,
+    window: WindowModel = USUAL,
+) -> Array:
     """One layer at one height: (ny, nx), NaN where nothing was measured ("measured" itself: 1 and 0, never NaN).
 
     norm is the magnitude of the mean field; sd the root of the summed variances of the components; gradient the
-    Frobenius norm of the derivative with x and y; information and expected_error those of `WindowModel()`, the latter
-    NaN too where no window that ends there is mapped. Raises InvalidInput naming the layers, or heights, of this map.
+    Frobenius norm of the derivative with x and y; information and expected_error those of `window`, the latter NaN
+    too where no window that ends there is mapped. Raises InvalidInput naming the layers, or heights, of this map.
     """
     check_layer(grid, layer, stored)
     if not 0 <= height_index < len(grid.heights_m):
@@ -98,11 +134,11 @@ def layer_values(grid: FieldGrid, layer: str, height_index: int = 0, stored: Sto
     measured = grid.measured[height_index]
     if layer == "measured":
         return np.asarray(measured.astype(np.float64))
-    raw = stored[layer][height_index] if layer in STORED_LAYERS else _raw_values(grid, layer, height_index)
+    raw = stored[layer][height_index] if layer in STORED_LAYERS else _raw_values(grid, layer, height_index, window)
     return np.asarray(np.where(measured, raw, np.nan), dtype=np.float64)
 
 
-def _raw_values(grid: FieldGrid, layer: str, k: int) -> Array:
+def _raw_values(grid: FieldGrid, layer: str, k: int, window: WindowModel) -> Array:
     if layer == "norm":
         return np.asarray(np.linalg.norm(grid.mean_uT[k].astype(np.float64), axis=-1))
     if layer == "sd":
@@ -111,9 +147,9 @@ def _raw_values(grid: FieldGrid, layer: str, k: int) -> Array:
         along = gradient_norms(grid.gradient_uT_per_m[k, ..., :2])  # a third column, where there is one, is with height
         return {"gradient": along.total, "gradient_x": along.x, "gradient_y": along.y}[layer]
     if layer == "information":
-        return point_information(grid, k, WindowModel().noise_uT)
+        return point_information(grid, k, window.noise_uT)
     if layer == "expected_error":
-        return expected_error_m(grid, k, WindowModel())
+        return expected_error_m(grid, k, window)
     return np.asarray(grid.mean_uT[k, ..., grid.component_names.index(layer)].astype(np.float64))
 
 

@@ -77,6 +77,38 @@ def test_it_takes_a_finished_map_of_ones_own(
     service.run_jobs()
 
 
+def picture(service: Any, map_id: str, layer: str, **asked: object) -> Any:
+    return service.http.get(f"/v1/maps/{map_id}/heatmap.png", params={"layer": layer, **asked})
+
+
+def test_the_picture_is_of_the_window_and_sensor_that_were_stated(service: Any, active_map: str) -> None:
+    shown = [
+        picture(service, active_map, "expected_error", **asked)
+        for asked in ({}, {"window_m": 3}, {"noise_ut": 3}, {"bias": "unknown"}, {"heading": "known"})
+    ]
+    assert {answer.status_code for answer in shown} == {200}
+    assert len({answer.headers["etag"] for answer in shown}) == len({answer.content for answer in shown}) == 5
+    same = picture(service, active_map, "expected_error", window_m=10, noise_ut=0.5, bias="known", heading="unknown")
+    assert (same.headers["etag"], same.content) == (shown[0].headers["etag"], shown[0].content)
+    better, worse = (picture(service, active_map, "information", noise_ut=noise) for noise in (0.5, 3))
+    assert better.headers["etag"] != worse.headers["etag"]
+    assert better.content != worse.content
+
+
+@pytest.mark.parametrize(
+    ("layer", "asked"),
+    [("norm", {"window_m": 10}), ("information", {"bias": "known"}), ("sd", {"noise_ut": 1, "heading": "known"})],
+)
+def test_a_parameter_of_another_layer_is_refused(
+    service: Any, active_map: str, layer: str, asked: dict[str, object]
+) -> None:
+    answer = picture(service, active_map, layer, **asked)
+    assert answer.status_code == 422
+    assert {each["location"] for each in answer.json()["errors"]} == {f"/query/{name}" for name in asked}
+    assert f"does not belong to the layer {layer}" in answer.json()["detail"]
+    assert picture(service, active_map, "expected_error", window_m=51).status_code == 422
+
+
 @pytest.mark.parametrize("layer", ["gradient_x", "gradient_y", "information", "expected_error"])
 def test_the_layers_are_pictures(service: Any, active_map: str, layer: str) -> None:
     answer = service.http.get(f"/v1/maps/{active_map}/heatmap.png", params={"layer": layer})

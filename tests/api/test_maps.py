@@ -57,11 +57,15 @@ def test_an_export_has_the_layers_of_the_fit_and_no_gradient_on_request(
     def export(map_id: str, **more: str) -> Any:
         return service.http.get(f"/v1/maps/{map_id}/export", params={"format": format, **more})
 
-    answers = [export(layered_map), export(layered_map, gradient="false"), export(old_map)]
-    assert [answer.status_code for answer in answers] == [200, 200, 200]
-    assert len({answer.headers["etag"] for answer in answers}) == 3
-    assert [b"coverage" in answer.content for answer in answers] == [True, True, False]
-    assert [b"dbx_dy_ut_per_m" in answer.content for answer in answers] == [True, False, True]
+    answers = [
+        export(layered_map), export(layered_map, gradient="false"), export(old_map),
+        export(layered_map, localizability="true"),
+    ]  # fmt: skip
+    assert [answer.status_code for answer in answers] == [200] * 4
+    assert len({answer.headers["etag"] for answer in answers}) == 4
+    assert [b"coverage" in answer.content for answer in answers] == [True, True, False, True]
+    assert [b"dbx_dy_ut_per_m" in answer.content for answer in answers] == [True, False, True, True]
+    assert [b"expected_error_m" in answer.content for answer in answers] == [False, False, False, True]
     assert answers[0].headers["content-disposition"].startswith('attachment; filename="isodyn-')
 
 
@@ -97,11 +101,16 @@ def test_heat_maps_are_pictures(service: Any, active_map: str, layer: str) -> No
 
 def test_the_nearest_height_is_the_one_picture_of_all_near_it(service: Any, active_map: str) -> None:
     path = f"/v1/maps/{active_map}/heatmap.png"
-    etags = {service.http.get(path, params=asked).headers["etag"] for asked in ({}, {"height_m": 1}, {"height_m": 99})}
+    etags = {service.http.get(path, params=asked).headers["etag"] for asked in ({}, {"height_m": 1}, {"height_m": 1.7})}
     assert len(etags) == 1, "a map of one height"
     assert service.http.get(path, params={"layer": "sd"}).headers["etag"] not in etags
     assert service.http.get(path, headers={"If-None-Match": etags.pop()}).status_code == 304
     assert service.http.get(path, params={"height_m": "nan"}).status_code == 422
+    for far in (path, f"/v1/maps/{active_map}/localizability"):
+        refused = service.http.get(far, params={"height_m": 1.8})
+        assert refused.status_code == 422, "six decimetres from the only height"
+        assert "1.20 m" in refused.json()["detail"]
+        assert refused.json()["errors"][0]["location"] == "/query/height_m"
 
 
 @pytest.mark.parametrize("layer", ["colour", "coverage", "horizontal", "a b\r\nc", "Ω"])
@@ -317,6 +326,65 @@ def test_a_rebuild_continues_the_last_fit_and_says_what_changed(service: Any, ne
     assert without["changes"]["surveys_removed"] == again["changes"]["surveys_added"] == [last]
     assert without["sha256"] != first["sha256"] == again["sha256"]
     assert service.blob_count() == blobs + 5, "two grids, layers, three reports, and of the states of fits the last two"
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown"),
+    [
+        ({}, {"kernel": "matern32", "noise": "walk", "hard_iron": True, "heights_m": None, "robust": False}),
+        ({"curl_free": True}, {"kernel": "squared_exponential", "curl_free": True, "refine": False}),
+        ({"heights_m": [0.9, 1.5], "noise": "white", "hard_iron": False, "robust": True}, {"curl_free": False}),
+        ({"kernel": "matern52+matern52", "refine": True}, {}),
+    ],
+)
+def test_a_map_shows_what_was_asked_for(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], asked: Any, shown: Any
+) -> None:
+    floor = new_floor(auto_build=False)
+    service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(1))
+    answer = service.http.post(f"/v1/floors/{floor}/maps", json=asked).json()
+    made = service.http.get(f"/v1/maps/{answer['map']['id']}").json()
+    assert made == answer["map"]
+    assert {name: made[name] for name in asked | shown} == asked | shown
+    service.http.delete(f"/v1/jobs/{answer['job']['id']}")
+
+
+def test_a_floor_that_outgrows_the_exact_engine_is_built_by_the_default_one(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes]
+) -> None:
+    floor = new_floor()
+    asked = {"engine": "exact", "components": "norm", "resolution_m": 0.5}
+
+    def upload(*walk: float) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The job that follows, and its map."""
+        job = service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(*walk)).json()["job"]
+        service.run_jobs()
+        ended = service.http.get(f"/v1/jobs/{job['id']}").json()
+        return ended, service.http.get(f"/v1/maps/{ended['map_id']}").json()
+
+    upload(1, 4.0, 3.0)
+    assert service.http.post(f"/v1/floors/{floor}/maps", json=asked).status_code == 202
+    service.run_jobs()
+    job, still = upload(2, 4.0, 3.0)
+    assert (still["engine"], job["result"]["changes"]["fallback"]) == ("exact", None)
+    for walk in ((3, 100.0, 8.0), (4, 6.0, 4.0)):
+        job, grown = upload(*walk)
+        assert (job["status"], grown["active"], grown["engine"]) == ("successful", True, "hilbert")
+        assert (grown["components"], grown["resolution_m"]) == ("norm", 0.5), "the rest stays as asked"
+        quality = service.http.get(f"/v1/maps/{grown['id']}/quality").json()
+        told = quality["changes"]["fallback"]
+        if walk[0] == 3:
+            assert "at most 2000 observations" in told
+            assert told in job["message"]
+        else:
+            assert told is None, "it was said once"
+            assert quality["changes"]["hyperparameters"] == "kept"
+    refused = service.http.post(f"/v1/floors/{floor}/maps", json=asked)
+    assert refused.status_code == 422
+    assert refused.json()["errors"][0]["location"] == "/body/engine"
+    few = still["survey_ids"]
+    assert service.http.post(f"/v1/floors/{floor}/maps", json=asked | {"survey_ids": few}).status_code == 202
+    service.run_jobs()
 
 
 def test_pointers_have_etags_that_follow_their_state(service: Any, mapped_floor: str, active_map: str) -> None:

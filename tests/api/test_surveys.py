@@ -1,6 +1,7 @@
 """Uploads: what is taken, what is refused, and that a refusal stores nothing."""
 
 import gzip
+import json
 import threading
 import zlib
 from collections.abc import Callable
@@ -36,6 +37,12 @@ def test_a_survey_is_received_mapped_and_judged(service: Any, new_floor: NewFloo
     assert verdict["status"] == "consistent", verdict
     assert [c["component"] for c in verdict["components"]] == ["bx", "by", "bz"]
     assert verdict["change_point"] is None
+    told = verdict["localizability"]
+    assert told["step_m"] == 0.05
+    assert told["glm_ratio_of_means"] == pytest.approx(told["mean_signal_ut"] / told["mean_noise_ut"])
+    assert told["mean_noise_ut"] == pytest.approx(sum(c["rmse_ut"] ** 2 for c in verdict["components"]) ** 0.5, rel=0.2)
+    assert 0.1 < told["mean_signal_ut"] < 0.7, "fields of 2 to 14 uT/m"
+    assert told["glm_p5"] < told["glm_p50"] < told["glm_p95"]
     scored = floor_map["score"]
     assert scored["rmse_vec_ut"] == pytest.approx(sum(rmse**2 for rmse in scored["rmse_ut"]) ** 0.5)
     assert 0.0 < scored["rmse_of_norm_ut"] <= scored["rmse_vec_ut"]
@@ -48,6 +55,165 @@ def test_a_survey_is_received_mapped_and_judged(service: Any, new_floor: NewFloo
     samples = service.http.get(f"/v1/surveys/{ids[0]}/samples", params={"limit": 10}).json()
     assert samples["columns"] == ["t_s", "x_m", "y_m", "z_m", "bx_ut", "by_ut", "bz_ut"]
     assert 5 <= len(samples["rows"]) <= 10
+
+
+def as_ndjson(data: bytes) -> bytes:
+    header, *rows = data.decode().split()
+    columns = header.split(",")
+    records = [dict(zip(columns, map(float, row.split(",")), strict=True)) for row in rows]
+    return "\n".join(map(json.dumps, records)).encode()
+
+
+def upload(service: Any, floor: str, data: bytes, **asked: object) -> Any:
+    return service.http.post(f"/v1/floors/{floor}/surveys", params=asked, content=data)
+
+
+def surveys_of(service: Any, floor: str) -> list[str]:
+    return [each["id"] for each in service.http.get(f"/v1/floors/{floor}/surveys").json()["items"]]
+
+
+def test_equal_samples_are_the_same_survey_whatever_the_format(
+    service: Any, new_floor: NewFloor, walk_csv: Walk
+) -> None:
+    floor, elsewhere, data = new_floor(), new_floor(), walk_csv(4)
+    first = upload(service, floor, data).json()
+    again = upload(service, floor, as_ndjson(data), format="ndjson", name="the same")
+    assert (again.status_code, again.json()) == (200, first)
+    assert upload(service, elsewhere, as_ndjson(data), format="ndjson").status_code == 202
+    assert upload(service, floor, data, frame="level").status_code == 202, "read otherwise: other samples"
+    assert len(surveys_of(service, floor)) == 2
+
+
+def test_what_was_left_out_stays_out_and_what_was_deleted_comes_again(
+    service: Any, new_floor: NewFloor, walk_csv: Walk
+) -> None:
+    floor, data = new_floor(), walk_csv(4)
+    url = f"/v1/surveys/{upload(service, floor, data).json()['survey']['id']}"
+    service.http.patch(url, json={"included": False})
+    for answer in (upload(service, floor, data), upload(service, floor, as_ndjson(data), format="ndjson")):
+        assert answer.status_code == 200
+        assert (answer.json()["survey"]["included"], answer.json()["job"]) == (False, None)
+    assert service.http.delete(url).status_code == 204
+    again = upload(service, floor, as_ndjson(data), format="ndjson")
+    assert again.status_code == 202
+    assert again.json()["survey"]["included"]
+
+
+QUATERNIONS = ",qw,qx,qy,qz"
+
+
+def with_attitude(data: bytes) -> bytes:
+    """The same walk by a sensor that never turned."""
+    header, *rows = data.decode().split()
+    return "\n".join([header + QUATERNIONS, *(row + ",1,0,0,0" for row in rows)]).encode()
+
+
+def test_an_upload_may_say_its_calibration_session(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor, data = new_floor(), with_attitude(walk_csv(1))
+    answer = upload(service, floor, data, session="robot-7 monday")
+    assert answer.status_code == 202, answer.text
+    survey = answer.json()["survey"]
+    assert survey["session"] == "robot-7 monday"
+    assert service.http.get(f"/v1/surveys/{survey['id']}/report").json()["session"] == "robot-7 monday"
+    upload(service, floor, with_attitude(walk_csv(2, offset_m=0.3)), session="robot-7 monday")
+    service.run_jobs()
+    active = service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
+    quality = service.http.get(f"/v1/maps/{active}/quality").json()
+    assert list(quality["hard_iron"]["sessions"]) == ["robot-7 monday"]
+    assert upload(service, floor, data).json()["survey"] == survey, "nothing said, nothing contradicted"
+    other = upload(service, floor, data, session="robot-7 tuesday")
+    assert other.status_code == 409
+    assert f"replaces={survey['id']}" in other.json()["detail"]
+    twin = upload(service, floor, as_ndjson(data), format="ndjson", session="robot-7 tuesday")
+    assert twin.status_code == 202, "another offset, other samples"
+    assert upload(service, floor, data, session="robot-7 tuesday").json()["survey"] == twin.json()["survey"]
+    service.http.delete(f"/v1/surveys/{twin.json()['survey']['id']}")
+    instead = upload(service, floor, data, session="robot-7 tuesday", replaces=survey["id"])
+    assert instead.status_code == 202
+    assert instead.json()["survey"]["session"] == "robot-7 tuesday"
+    assert len(surveys_of(service, floor)) == 2
+
+
+@pytest.mark.parametrize("format", ["csv", "indoor-location-2020"])
+def test_a_session_is_refused_where_it_means_nothing(
+    service: Any, mapped_floor: str, walk_csv: Walk, format: str
+) -> None:
+    before = service.row_counts(), service.blob_count()
+    answer = upload(service, mapped_floor, walk_csv(1), format=format, session="monday")
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["location"] == "session"
+    assert (service.row_counts(), service.blob_count()) == before
+
+
+def test_a_survey_takes_the_place_of_another_in_one_step(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor()
+    old = upload(service, floor, walk_csv(1)).json()["survey"]["id"]
+    kept = upload(service, floor, walk_csv(2)).json()["survey"]["id"]
+    service.run_jobs()
+    jobs = service.row_counts()["job"]
+    answer = upload(service, floor, walk_csv(3), replaces=old)
+    assert answer.status_code == 202
+    new = answer.json()["survey"]
+    assert new["replaces"] == old
+    assert service.row_counts()["job"] == jobs + 1
+    assert service.http.get(f"/v1/surveys/{old}").status_code == 404
+    assert sorted(surveys_of(service, floor)) == sorted([kept, new["id"]])
+    again = upload(service, floor, walk_csv(3), replaces=old)
+    assert (again.status_code, again.json()) == (200, answer.json())
+    service.run_jobs()
+    job = service.http.get(f"/v1/jobs/{answer.json()['job']['id']}").json()
+    assert sorted(service.http.get(f"/v1/maps/{job['map_id']}").json()["survey_ids"]) == sorted([kept, new["id"]])
+    assert upload(service, floor, walk_csv(3), replaces=new["id"]).status_code == 200, "by itself"
+
+
+def test_a_replacement_with_a_key_is_answered_once(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor = new_floor(auto_build=False)
+    old = upload(service, floor, walk_csv(1)).json()["survey"]["id"]
+    asked = {"params": {"replaces": old}, "content": walk_csv(2), "headers": {"Idempotency-Key": f"replace-{old}"}}
+    first, again = (service.http.post(f"/v1/floors/{floor}/surveys", **asked) for _ in range(2))
+    assert (first.status_code, again.status_code) == (202, 202)
+    assert first.json() == again.json()
+    assert first.json()["job"] is None
+
+
+def test_only_a_survey_of_the_same_floor_is_replaced(
+    service: Any, new_floor: NewFloor, walk_csv: Walk, stranger: dict[str, str]
+) -> None:
+    floor, other = new_floor(), new_floor()
+    old, there = (upload(service, each, walk_csv(1)).json()["survey"]["id"] for each in (floor, other))
+    twin = upload(service, floor, walk_csv(2)).json()["survey"]["id"]
+    before = service.row_counts(), service.blob_count()
+    assert upload(service, floor, walk_csv(3), replaces="nobody").status_code == 404
+    refused = upload(service, floor, walk_csv(3), replaces=there)
+    assert refused.status_code == 422
+    assert refused.json()["errors"][0]["location"] == "/query/replaces"
+    foreign = service.http.post("/v1/buildings", json={"name": "Theirs"}, headers=stranger).json()["id"]
+    path = f"/v1/buildings/{foreign}/floors"
+    theirs = service.http.post(path, json={"name": "G", "ordinal": 0}, headers=stranger).json()["id"]
+    answer = service.http.post(
+        f"/v1/floors/{theirs}/surveys", params={"replaces": old}, content=walk_csv(3), headers=stranger
+    )
+    assert answer.status_code == 404
+    assert service.blob_count() == before[1]
+    assert upload(service, floor, walk_csv(2), replaces=old).status_code == 409, f"is {twin} already"
+    assert sorted(surveys_of(service, floor)) == sorted([old, twin])
+
+
+def test_a_change_names_the_rebuild_it_set_off(service: Any, new_floor: NewFloor, walk_csv: Walk) -> None:
+    floor, quiet = new_floor(), new_floor(auto_build=False)
+    first, second = (upload(service, floor, walk_csv(seed)).json()["survey"]["id"] for seed in (1, 2))
+    patched = service.http.patch(f"/v1/surveys/{second}", json={"included": False}).json()
+    assert patched["job"]["status"] == "accepted"
+    assert patched["included"] is False
+    assert service.http.patch(f"/v1/surveys/{second}", json={"included": False}).json()["job"] is None
+    gone = service.http.delete(f"/v1/surveys/{second}")
+    target = gone.headers["link"].removeprefix("<").removesuffix('>; rel="monitor"')
+    assert service.http.get(target).json()["kind"] == "rebuild"
+    assert "link" not in service.http.delete(f"/v1/surveys/{first}").headers, "nothing is left to build from"
+    service.http.delete(target)
+    only = upload(service, quiet, walk_csv(1)).json()["survey"]["id"]
+    assert service.http.patch(f"/v1/surveys/{only}", json={"included": False}).json()["job"] is None
+    assert "link" not in service.http.delete(f"/v1/surveys/{only}").headers
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "zstd"])

@@ -16,6 +16,7 @@ import xarray as xr
 import zarr
 from covjson_pydantic.coverage import Coverage
 
+from app.field.expected_error import WindowModel, expected_error_m, point_information
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components
 from app.services.export_map import MEDIA_TYPES, ExportFormat, export_map
@@ -112,6 +113,30 @@ def test_what_was_not_measured_is_missing(format: ExportFormat, tmp_path: Path) 
         np.testing.assert_array_equal(dataset[name], np.where(grid.measured, layer, np.nan))
     if format != "csv":
         np.testing.assert_array_equal(dataset["measured"], grid.measured)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_tells_places_apart_comes_on_request(format: ExportFormat, tmp_path: Path) -> None:
+    grid, window = make_grid(shape=(2, 60, 70)), WindowModel()
+    usual = set(read(format, export_map(grid, format, SHA256), tmp_path).data_vars)
+    dataset = read(format, export_map(grid, format, SHA256, localizability=True), tmp_path).transpose(
+        "z", "y", "x", ...
+    )
+    expected = {
+        "gradient_ut_per_m": np.linalg.norm(grid.gradient_uT_per_m, axis=(-2, -1)),
+        "gradient_x_ut_per_m": np.linalg.norm(grid.gradient_uT_per_m[..., 0], axis=-1),
+        "gradient_y_ut_per_m": np.linalg.norm(grid.gradient_uT_per_m[..., 1], axis=-1),
+        "information_per_m2": np.stack([point_information(grid, k, 0.5) for k in (0, 1)]),
+        "expected_error_m": np.stack([expected_error_m(grid, k, window) for k in (0, 1)]),
+    }
+    assert set(dataset.data_vars) - usual == set(expected)
+    assert np.isfinite(expected["expected_error_m"]).sum() > 1000
+    for name, values in expected.items():
+        np.testing.assert_allclose(dataset[name], np.where(grid.measured, values, np.nan), rtol=1e-5, atol=6e-5)
+    if format in ("netcdf", "zarr"):
+        about = dataset["expected_error_m"].attrs
+        assert about["units"] == "m"
+        assert "a straight window of 10 m that ends here, 0.5 uT of noise, heading unknown" in about["long_name"]
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -56,6 +56,20 @@ def test_quaternions_decide_over_the_frame_and_the_report_says_so(table, writers
     assert any("frame=level was ignored" in text for text in walk.report["assumptions"])
 
 
+def test_a_table_with_quaternions_may_say_its_calibration_session(table, written):
+    format, write = written
+    walk = read_survey(write(table), format=format, session="robot-7 monday")
+    assert walk.samples.session == walk.report["session"] == "robot-7 monday"
+    assert read_survey(write(table), format=format).samples.session is None
+    error = refused(write(plain(table)), format, session="robot-7 monday")
+    assert error.faults[0].location == "session"
+    assert "qw,qx,qy,qz" in str(error)
+
+
+def test_a_trace_says_its_session_itself():
+    assert "itself" in str(refused(b"", "indoor-location-2020", session="monday"))
+
+
 def test_norm_is_the_length_of_three_columns_or_one_column(table, written):
     format, write = written
     columns = plain(table)

@@ -47,7 +47,10 @@ def test_stored_layers_are_those_of_the_map_where_it_was_measured(grid_of):
 
 def test_the_nearest_height_is_taken(grid_of):
     grid = grid_of(heights=3)  # 1.2, 1.7 and 2.2 m
-    assert [nearest_height(grid, z) for z in (None, -9.0, 1.44, 1.46, 1.96, 50.0)] == [0, 0, 0, 1, 2, 2]
+    assert [nearest_height(grid, z) for z in (None, 0.75, 1.44, 1.46, 1.96, 2.65)] == [0, 0, 0, 1, 2, 2]
+    for far_m in (-9.0, 0.65, 2.75, 50.0):
+        with pytest.raises(InvalidInput, match=r"1\.20, 1\.70, 2\.20 m"):
+            nearest_height(grid, far_m)
 
 
 def test_the_gradient_along_the_floor_leaves_the_vertical_out(grid_of):
