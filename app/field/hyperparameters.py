@@ -21,7 +21,7 @@ LONG_WAVES = 0.3
 """Variance of the fields longer than a box of a potential, each over the signal's."""
 DETAIL_IN_AIR = 0.15
 """Share of a potential's detail that is there where nothing but air is."""
-SOURCE_FREE = 0.05
+SOURCE_FREE = 0.07
 """Sd of the divergence left where somebody walked, over the prior's: labels are off by a little, air is not steel."""
 
 

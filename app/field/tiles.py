@@ -53,8 +53,8 @@ BORDER_POINTS = 9
 ROOM_M = 0.5
 """The heights of a slab are rounded outwards to this, so that the next survey fits in."""
 
-AIR_BEYOND_M = 0.3
-"""Above and below what was walked there is air as well, for a hand's breadth at least."""
+AIR_BEYOND_M = 0.1
+"""Above and below what was walked there is air as well, a hand's breadth of it."""
 
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""

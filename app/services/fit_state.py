@@ -25,7 +25,7 @@ __all__ = ["LARGEST_BYTES", "state_from_bytes", "state_to_bytes"]
 
 LARGEST_BYTES = 400_000_000
 """A larger state is not kept: reading it would cost as much as fitting anew."""
-_VERSION = f"{__version__}-1"
+_VERSION = f"{__version__}-2"
 
 
 def state_to_bytes(state: FitState) -> bytes | None:
