@@ -38,6 +38,10 @@ LONGEST_IN_SLAB = 0.3
 GOOD_ENOUGH_SLAB = 2.6
 CRAMPED = 1.05
 """A length this near to the least a lattice can tell would be shorter if it could."""
+SHORTER_POTENTIAL = 0.92
+"""Where a potential bends most it has less than the likeliest length: maps of analytic buildings, surveyed at one
+height, are best at about this share of it, and their sds are honest. Several heights tell more."""
+ONE_HEIGHT_M = 0.4
 START_IN_SLAB_M = 1.0
 """Boxes have few functions to spare: too coarse ones make a rough field look smooth, too fine ones only cost."""
 LARGE_OFFSET = 0.01
@@ -119,6 +123,8 @@ def learn(walks: Sequence[Walk], ambient_uT: Array, spec: MapSpec, slab: Heights
     if spec.noise == "walk":
         found = _learn_walk_noise(learner, found, progress)
     hyper = found.hyper
+    if spec.curl_free and slab is not None and slab.walked_m[1] - slab.walked_m[0] < ONE_HEIGHT_M:
+        hyper = replace(hyper, length_m=SHORTER_POTENTIAL * hyper.length_m)
     if slab is not None:
         lattice = Lattice.of_slabs(kernel, hyper.finest_length_m, slab.walked_m, spec.curl_free, slab.held_m)
     else:
