@@ -168,6 +168,8 @@ def _check_together(body: NewMap) -> None:
         faults.append(Fault("/body/refine", "needs engine hilbert"))
     if body.kernel is not None and is_sum(body.kernel) and body.engine != "hilbert":
         faults.append(Fault("/body/kernel", f"a sum needs engine hilbert; ask for {base_kernel(body.kernel)}"))
+    if body.kernel is not None and is_sum(body.kernel) and body.curl_free:
+        faults.append(Fault("/body/kernel", f"a potential has one length; ask for {base_kernel(body.kernel)}"))
     if body.heights_m is not None and any(b - a < 0.01 for a, b in pairwise(body.heights_m)):
         faults.append(Fault("/body/heights_m", "heights must rise, by a centimetre at least"))
     if faults:

@@ -8,6 +8,7 @@ import numpy as np
 from app.field.observations import Walk
 from app.field.raster import GridFrame
 from app.field.tile_fit import FitState
+from app.field.tiles import REACH_M
 from app.geometry import Array
 
 __all__ = ["FieldEstimate", "ambient_field_uT"]
@@ -23,6 +24,7 @@ class FieldEstimate:
     held_out_mean_uT (n, c), held_out_variance_ratio (n, c) or (n, 1): each survey's observations, by survey id,
     predicted from all the other surveys
     discredited: surveys so much noisier than the others that they say nothing of the next one's errors
+    reach_up_m: how far above and below the surveys it is believed
     state: what the next fit can start from; tiles_refitted of all tiles; continued: with what an earlier
     fit had learned
     """
@@ -38,6 +40,7 @@ class FieldEstimate:
     held_out_variance_ratio: Mapping[str, Array]
     hyperparameters: dict[str, object]
     discredited: frozenset[str] = frozenset()
+    reach_up_m: float = REACH_M
     state: FitState | None = None
     tiles_refitted: int = 0
     continued: bool = False

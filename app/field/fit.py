@@ -16,6 +16,7 @@ from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
 from app.field.hard_iron import Cleaned, HardIron, remove_hard_iron
 from app.field.hilbert_engine import estimate_by_hilbert
+from app.field.kernels import base_kernel, is_sum
 from app.field.leave_one_out import HeldOut, error_correlation_m, score
 from app.field.measured import measured_cells, near_other_walks
 from app.field.noise_calibration import NEW, noise_sd_by_survey
@@ -119,6 +120,10 @@ def _check(spec: MapSpec) -> None:
         raise InvalidInput(f"a {spec.components} map has no curl to be free of: ask for components vector")
     if spec.curl_free and spec.engine != "hilbert":
         raise InvalidInput(f"the {spec.engine} engine has independent components: curl_free needs engine hilbert")
+    if spec.curl_free and is_sum(spec.covariance):
+        raise InvalidInput(
+            f"the potential of a curl-free map has one length: ask for kernel {base_kernel(spec.covariance)}"
+        )
     if spec.refine and spec.engine != "hilbert":
         raise InvalidInput(f"the {spec.engine} engine does not refine walks: refine needs engine hilbert")
 

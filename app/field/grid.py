@@ -16,6 +16,9 @@ from app.geometry import Array
 
 __all__ = ["FieldGrid", "FieldValues"]
 
+AT_HEIGHT_M = 0.01
+"""This far above or below its layers a map of several heights still answers."""
+
 Float32 = NDArray[np.float32]
 
 
@@ -81,16 +84,16 @@ class FieldGrid:
     def at(self, points_m: Array) -> FieldValues:
         """The field at points (n, 3) or (n, 2) of the building frame.
 
-        A map with one height answers at that height whatever z says; with several, between them (outside: nearest).
-        A point is `measured` when the four cell centres around it are, on every layer used; elsewhere values are the
-        prior's, so that a caller who ignores `measured` gets an honest, wide answer.
+        A map with one height answers at that height whatever z says; with several, between them (points without z: at
+        the lowest). A point is `measured` when the four cell centres around it are, on every layer used; outside the
+        map values are the prior's, so that a caller who ignores `measured` gets an honest, wide answer.
         """
         p = np.atleast_2d(np.asarray(points_m, dtype=np.float64))
         n = len(p)
         nz, ny, nx, c = self.mean_uT.shape
         u = (p[:, 0] - self.origin_m[0]) / self.resolution_m
         v = (p[:, 1] - self.origin_m[1]) / self.resolution_m
-        inside = (u >= 0) & (u <= nx - 1) & (v >= 0) & (v <= ny - 1)
+        inside = (u >= 0) & (u <= nx - 1) & (v >= 0) & (v <= ny - 1) & self.between_layers(p)
         i = np.clip(np.floor(u).astype(np.int64), 0, max(nx - 2, 0))
         j = np.clip(np.floor(v).astype(np.int64), 0, max(ny - 2, 0))
         fu, fv = np.clip(u - i, 0.0, 1.0), np.clip(v - j, 0.0, 1.0)
@@ -110,6 +113,13 @@ class FieldGrid:
         outside = ~inside
         mean[outside], variance[outside], gradient[outside] = self.ambient_uT, np.square(self.prior_sd_uT), 0.0
         return FieldValues(mean, np.sqrt(variance), gradient, measured)
+
+    def between_layers(self, p: Array) -> NDArray[np.bool_]:
+        """Whether points (n, 2 or 3) are between the lowest and the highest layer; one layer holds for all heights."""
+        if len(self.heights_m) == 1 or p.shape[1] < 3:
+            return np.ones(len(p), dtype=np.bool_)
+        low_m, high_m = self.heights_m[[0, -1]]
+        return np.asarray((p[:, 2] >= low_m - AT_HEIGHT_M) & (p[:, 2] <= high_m + AT_HEIGHT_M))
 
     def _layers(self, p: Array) -> tuple[NDArray[np.int64], Array]:
         """Index of the layer below each point and the fraction of the way to the next one."""

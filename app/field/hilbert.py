@@ -20,6 +20,9 @@ from app.field.statistics import Evidence
 from app.field.triangular import inverse_of_lower
 from app.geometry import Array
 
+VARIANCE_EVERY = 0.75
+"""Layers closer than this over the cutoff share their variances: they cost far more than the field, and vary slowly."""
+
 __all__ = ["Patch", "PlanePosterior", "SlabPosterior", "posterior", "predict"]
 
 FEW_POINTS = 0.7
@@ -113,10 +116,12 @@ class SlabPosterior:
         """The field at the crossings of columns, rows and heights."""
         sums, mean, gradient = self.basis.on_lattice(self.weights_uT, x_m, y_m, heights_m)
         y, x = (each.ravel() for each in np.meshgrid(y_m, x_m, indexing="ij"))
+        some = _spread_out(heights_m, VARIANCE_EVERY / self.basis.cutoff_rad_per_m)
         variance = np.stack(
-            [self._variance(self.basis.rows(np.column_stack([x, y, np.full(len(x), z)]))) for z in heights_m], axis=1
+            [self._variance(self.basis.rows(np.column_stack([x, y, np.full(len(x), z)]))) for z in heights_m[some]],
+            axis=1,
         )
-        variance = variance.reshape(*variance.shape[:2], len(y_m), len(x_m))
+        variance = _between(heights_m[some], variance, heights_m).reshape(-1, len(heights_m), len(y_m), len(x_m))
         return Patch(mean, gradient, variance, sums[0] if self.basis.potential else None)
 
     def potential_uT_m(self, points_m: Array) -> Array:
@@ -128,6 +133,23 @@ class SlabPosterior:
         r, n, m = rows.shape
         half = dtrsm(1.0, self.factor, (rows * self.root).reshape(r * n, m).T, lower=1)
         return np.asarray(np.minimum(np.einsum("mn,mn->n", half, half).reshape(r, n) + self.detail_ratio, 1.0))
+
+
+def _spread_out(heights_m: Array, apart_m: float) -> list[int]:
+    """Of rising heights the first, those at least so far apart, and the last."""
+    chosen = [0]
+    for index, height_m in enumerate(heights_m):
+        if height_m - heights_m[chosen[-1]] >= apart_m or 0 < index == len(heights_m) - 1:
+            chosen.append(index)
+    return chosen
+
+
+def _between(known_m: Array, values: Array, heights_m: Array) -> Array:
+    """(r, heights, n) of values (r, known, n): linear between known heights, and exact at them."""
+    below = np.clip(np.searchsorted(known_m, heights_m, side="right") - 1, 0, max(len(known_m) - 2, 0))
+    above = np.minimum(below + 1, len(known_m) - 1)
+    share = (heights_m - known_m[below]) / np.where(above > below, known_m[above] - known_m[below], 1.0)
+    return np.asarray(values[:, below] * (1.0 - share)[:, None] + values[:, above] * share[:, None])
 
 
 def posterior(

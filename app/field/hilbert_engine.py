@@ -9,7 +9,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from app.field.continuation import in_terms_of, spread_uT, with_continuation
 from app.field.estimate import FieldEstimate, ambient_field_uT
 from app.field.hard_iron import Cleaned
 from app.field.held_out_choice import choose_by_held_out_surveys
@@ -17,12 +19,12 @@ from app.field.learning import learn
 from app.field.leave_one_out import HeldOutPrediction
 from app.field.observations import Walk
 from app.field.potential import blend_potentials
-from app.field.raster import Blended, GridFrame, blend, layer_heights_m
+from app.field.raster import Blended, GridFrame, blend, layer_heights_m, on_all_layers, reach_up_m, reachable
 from app.field.spec import MapSpec, Progress
 from app.field.survey_noise import clearly_differ, survey_noise_scales
 from app.field.tile_fit import FitState, Learned, TileFit, fit_tile
 from app.field.tiled_walks import TiledWalks
-from app.field.tiles import Lattice, Slab, Tile
+from app.field.tiles import Heights, Lattice, Slab, Tile
 from app.geometry import Array
 
 __all__ = ["estimate_by_hilbert"]
@@ -30,7 +32,7 @@ __all__ = ["estimate_by_hilbert"]
 FLAT_M = 0.8
 """Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
 DISCREDITED = 10.0
-"""A survey this many times noisier than the others says nothing of the ambient field, or of what errors the next one has."""
+"""A survey this many times noisier than the others says nothing of the ambient field, nor of the next one's errors."""
 
 
 NOISE_ROUNDS = 2
@@ -51,14 +53,14 @@ def estimate_by_hilbert(
 ) -> FieldEstimate:
     """The blended field of all tiles, and the walks predicted by subtraction. Raises InvalidInput for a huge grid."""
     layers_m = layer_heights_m(walks, spec)
-    slab_m = _slab(walks, spec, layers_m)
-    if previous is not None and not _fits(previous.learned.lattice.slab, slab_m):
+    slab = _slab(walks, spec, layers_m)
+    if previous is not None and not _fits(previous.learned.lattice.slab, slab):
         previous = None
     old = previous.tiles if previous is not None and np.array_equal(previous.heights_m, layers_m) else {}
 
     def learned_with(noise_scale: Mapping[str, float]) -> Learned:
         ambient_uT = ambient_field_uT([walk for walk in walks if noise_scale[walk.survey_id] < DISCREDITED])
-        learned = learn(walks, ambient_uT, spec, slab_m, lambda f, text: progress(0.3 * f, text), noise_scale)
+        learned = learn(walks, ambient_uT, spec, slab, lambda f, text: progress(0.3 * f, text), noise_scale)
         learned = choose_by_held_out_surveys(walks, learned, spec, lambda f, text: progress(0.3 + 0.1 * f, text))
         return _with_offsets(learned, cleaned.offset_variance_uT2)
 
@@ -91,6 +93,7 @@ def _fit_tiles(
 ) -> _Fit:
     """One tile after the other; those of `kept` that the same surveys cross are taken as they are."""
     frame = GridFrame.around(walks, spec.resolution_m, learned.hyper.length_m, layers_m)
+    answered = _answered(walks, spec, layers_m)
     tiled = TiledWalks(learned.lattice, walks, learned.ambient_uT)
     tiles: dict[Tile, TileFit] = {}
     count = len(tiled.counts())
@@ -98,7 +101,7 @@ def _fit_tiles(
         fit = kept.get(tile)
         if fit is None or fit.surveys != tiled.crossing(tile):
             progress(index / count, f"fitting tile {index + 1} of {count}")
-            fit = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m, spec.robust)
+            fit = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m[answered], spec.robust)
         tiles[tile] = fit
     predicted = HeldOutPrediction(learned.lattice, walks, len(next(iter(tiles.values())).patch.variance_ratio))
     for tile, fit in tiles.items():
@@ -133,19 +136,29 @@ def _estimate(
 ) -> FieldEstimate:
     learned, frame, tiles, predicted = fit
     lattice, hyper = learned.lattice, learned.hyper
-    blended = _blend(lattice, frame, spec, tiles)
+    answered = _answered(walks, spec, layers_m)
+    blended = _blend(lattice, replace(frame, heights_m=layers_m[answered]), spec, tiles)
     components = len(learned.ambient_uT)
     prior_sd_uT, error_sd_uT = (np.broadcast_to(sd, components) for sd in (hyper.signal_sd_uT, hyper.error_sd_uT))
+    variance_ratio, held_out_ratio = blended.variance_ratio, predicted.variance_ratio
+    if spec.curl_free:
+        prior_sd_uT = spread_uT(walks, learned.ambient_uT)
+        in_prior = np.square(hyper.signal_sd_uT / prior_sd_uT)
+        variance_ratio = in_terms_of(
+            in_prior, with_continuation(blended, layers_m[answered], walks, hyper.signal_sd_uT)
+        )
+        held_out_ratio = {name: in_terms_of(in_prior, ratio.T).T for name, ratio in held_out_ratio.items()}
     return FieldEstimate(
         frame=frame,
         ambient_uT=learned.ambient_uT,
-        mean_uT=blended.mean_uT,
-        variance_ratio=blended.variance_ratio,
-        gradient_uT_per_m=blended.gradient_uT_per_m,
+        mean_uT=on_all_layers(blended.mean_uT, answered, 0.0),
+        variance_ratio=on_all_layers(variance_ratio, answered, 1.0),
+        gradient_uT_per_m=on_all_layers(blended.gradient_uT_per_m, answered, 0.0),
         prior_sd_uT=prior_sd_uT,
         error_sd_uT=error_sd_uT,
         held_out_mean_uT=predicted.mean_uT,
-        held_out_variance_ratio=predicted.variance_ratio,
+        held_out_variance_ratio=held_out_ratio,
+        reach_up_m=reach_up_m(spec),
         hyperparameters=hyper.as_json() | {"tile_pitch_m": lattice.pitch_m},
         discredited=frozenset(name for name, scale in hyper.noise_scale.items() if scale >= DISCREDITED),
         state=FitState(learned, layers_m, cleaned.hard_iron, tiles),
@@ -169,18 +182,25 @@ def _with_offsets(learned: Learned, offset_variance_uT2: Mapping[str, Array]) ->
     return replace(learned, hyper=replace(learned.hyper, offset_ratio=ratio))
 
 
-def _slab(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> tuple[float, float] | None:
-    """The heights between which the field is wanted or was measured; None when a plane will do."""
+def _answered(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> NDArray[np.bool_]:
+    """(nz,) layers to fit: all of a plane; in three dimensions those that are near enough to what was walked."""
+    z_m = np.concatenate([walk.position_m[:, 2] for walk in walks])
+    return reachable(layers_m, z_m, reach_up_m(spec))
+
+
+def _slab(walks: Sequence[Walk], spec: MapSpec, layers_m: Array) -> Heights | None:
+    """The heights that were walked, and those that are to be answered as well; None when a plane will do."""
     z_m = np.concatenate([walk.position_m[:, 2] for walk in walks])
     low_m, high_m = np.quantile(z_m, [0.05, 0.95])
     if not spec.curl_free and len(layers_m) == 1 and high_m - low_m < FLAT_M:
         return None
-    everything = np.append(z_m, layers_m)
-    return float(everything.min()), float(everything.max())
+    walked_m = float(z_m.min()), float(z_m.max())
+    held_m = np.append(layers_m[_answered(walks, spec, layers_m)], walked_m)
+    return Heights(walked_m, (float(held_m.min()), float(held_m.max())))
 
 
-def _fits(slab: Slab | None, slab_m: tuple[float, float] | None) -> bool:
+def _fits(slab: Slab | None, heights: Heights | None) -> bool:
     """Whether tiles that were made for a plane, or for some heights, serve these."""
-    if slab is None or slab_m is None:
-        return slab is None and slab_m is None
-    return slab.inner_m[0] <= slab_m[0] and slab_m[1] <= slab.inner_m[1]
+    if slab is None or heights is None:
+        return slab is None and heights is None
+    return slab.inner_m[0] <= heights.held_m[0] and heights.held_m[1] <= slab.inner_m[1]

@@ -17,7 +17,11 @@ __all__ = ["Basis", "Hyperparameters", "weight_variance"]
 
 Basis = CosineBasis | SlabBasis
 
-SOURCE_FREE = 0.05
+LONG_WAVES = 0.3
+"""Variance of the fields longer than a box of a potential, each over the signal's."""
+DETAIL_IN_AIR = 0.15
+"""Share of a potential's detail that is there where nothing but air is."""
+SOURCE_FREE = 0.07
 """Sd of the divergence left where somebody walked, over the prior's: labels are off by a little, air is not steel."""
 
 
@@ -71,13 +75,15 @@ class Hyperparameters:
     def detail_ratio(self, basis: Basis) -> float:
         """Share of the signal's variance finer than the basis can follow.
 
-        A slab is learned on the lattice it is used on, where detail shows as white error: there is no more of it.
+        A slab is learned on the lattice it is used on, where detail shows as white error: there is no more of it. And
+        a potential's signal is that of a field with sources everywhere: where there are none little of it is detail.
         """
         tail = sum(
             share * variance_beyond(kernel, basis.cutoff_rad_per_m, length_m, basis.dimensions, basis.potential)
             for kernel, length_m, share in self.terms
         )
-        return min(tail, self.white_ratio) if isinstance(basis, SlabBasis) else tail
+        share = DETAIL_IN_AIR if basis.potential else 1.0
+        return share * min(tail, self.white_ratio) if isinstance(basis, SlabBasis) else tail
 
     def white_ratio_in(self, basis: Basis, survey_id: str = "") -> float:
         """Of white error as the functions of a tile see it, detail included."""
@@ -120,12 +126,15 @@ class Hyperparameters:
 
 def weight_variance(terms: Sequence[Term], basis: Basis) -> Array:
     """(terms, m) variance of the weight of every function, by term of the kernel, shares included."""
-    return np.stack(
+    variance = np.stack(
         [
             share * spectral_density(kernel, basis.frequencies_squared, length_m, basis.dimensions, basis.potential)
             for kernel, length_m, share in terms
         ]
     )
+    if isinstance(basis, SlabBasis) and basis.long_waves:
+        variance[:, -basis.long_waves :] = np.array([[term.share * LONG_WAVES] for term in terms])
+    return variance
 
 
 @lru_cache(maxsize=8)

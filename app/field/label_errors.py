@@ -93,7 +93,7 @@ def fit_labels(
     The part of it that all components share, R (n, n) in units of each one's signal variance, is factored once.
     """
     columns = list(seen)
-    signal = hyper.signal_sd_uT[columns]
+    signal = np.broadcast_to(hyper.signal_sd_uT, walk.field_uT.shape[1])[columns]  # a potential has one for all
     slope = others.gradient_uT_per_m[:, columns] / signal[:, None]
     residual = (walk.field_uT - others.mean_uT)[:, columns] / signal + np.einsum("ncd,nd->nc", slope, start_m)
     latent = np.mean(others.variance_uT2[:, columns] / np.square(signal), axis=1)

@@ -19,7 +19,7 @@ from app.field.spec import BaseKernel, Kernel, MapSpec, Progress
 from app.field.statistics import SurveyStatistics
 from app.field.tile_fit import Learned
 from app.field.tiled_walks import TiledWalks
-from app.field.tiles import Lattice, Tile
+from app.field.tiles import Heights, Lattice, Tile
 from app.field.walk_noise import WHITE, WalkNoise
 from app.geometry import Array
 
@@ -40,9 +40,9 @@ LONGEST_IN_SLAB = 0.3
 GOOD_ENOUGH_SLAB = 2.6
 CRAMPED = 1.05
 """A length this near to the least a lattice can tell would be shorter if it could."""
-SHORTER_POTENTIAL = 0.75
-"""Boxes small enough for a likelihood lack the long waves of a potential, and their lengths come out too long: maps of
-analytic buildings are best at about this share of them, and a fifth worse at the whole. Several heights tell more."""
+SHORTER_POTENTIAL = 0.92
+"""Where a potential bends most it has less than the likeliest length: maps of analytic buildings, surveyed at one
+height, are best at about this share of it, and their sds are honest. Several heights tell more."""
 ONE_HEIGHT_M = 0.4
 START_IN_SLAB_M = 1.0
 """Boxes have few functions to spare: too coarse ones make a rough field look smooth, too fine ones only cost."""
@@ -111,27 +111,27 @@ def learn(
     walks: Sequence[Walk],
     ambient_uT: Array,
     spec: MapSpec,
-    slab_m: tuple[float, float] | None,
+    slab: Heights | None,
     progress: Progress,
     noise_scale: Mapping[str, float] = MappingProxyType({}),
 ) -> Learned:
-    """Maximum marginal likelihood, and the lattice that suits the length found: of slabs between heights `slab_m`.
+    """Maximum marginal likelihood, and the lattice that suits the length found; a slab is learned from its walks,
 
-    noise_scale: survey id -> factor on the variances of its errors, 1 for those not named.
+    whatever heights are to be answered. noise_scale: survey id -> factor on the variances of its errors.
     """
     kernel = spec.covariance
 
     def learning_lattice(length_m: float) -> Lattice:
-        if slab_m is not None:
-            return Lattice.of_slabs(kernel, length_m, slab_m, spec.curl_free)
+        if slab is not None:
+            return Lattice.of_slabs(kernel, length_m, slab.walked_m, spec.curl_free)
         suited = Lattice.for_length(kernel, WIDER_TO_LEARN * length_m, wide=True)
         return replace(suited, functions_per_axis=LEARNING_FUNCTIONS[base_kernel(kernel)])
 
     start_log = START_LOG.copy()
-    if slab_m is not None:
+    if slab is not None:
         start_log[0] = np.log(START_IN_SLAB_M)
     lattice = learning_lattice(float(np.exp(start_log[0])))
-    good_enough, finest = (GOOD_ENOUGH, LEARNABLE[0]) if slab_m is None else (GOOD_ENOUGH_SLAB, LEARNABLE_IN_SLAB)
+    good_enough, finest = (GOOD_ENOUGH, LEARNABLE[0]) if slab is None else (GOOD_ENOUGH_SLAB, LEARNABLE_IN_SLAB)
     for turn in range(ROUNDS):
         progress(0.5 * turn / ROUNDS, "learning length and noise")
         learner = _Learner(lattice, walks, ambient_uT, kernel, noise_scale)
@@ -145,15 +145,10 @@ def learn(
     if spec.noise == "walk":
         found = _learn_walk_noise(learner, found, progress)
     hyper = replace(found.hyper, noise_scale=dict(noise_scale))
-    if spec.curl_free and slab_m is not None and slab_m[1] - slab_m[0] < ONE_HEIGHT_M:
-        short = hyper.short_length_m
-        hyper = replace(
-            hyper,
-            length_m=SHORTER_POTENTIAL * hyper.length_m,
-            short_length_m=None if short is None else SHORTER_POTENTIAL * short,
-        )
-    if slab_m is not None:
-        lattice = Lattice.of_slabs(kernel, hyper.finest_length_m, slab_m, spec.curl_free)
+    if spec.curl_free and slab is not None and slab.walked_m[1] - slab.walked_m[0] < ONE_HEIGHT_M:
+        hyper = replace(hyper, length_m=SHORTER_POTENTIAL * hyper.length_m)
+    if slab is not None:
+        lattice = Lattice.of_slabs(kernel, hyper.finest_length_m, slab.walked_m, spec.curl_free, slab.held_m)
     else:
         wide = hyper.short_length_m is not None or hyper.bias_ratio + hyper.walk_ratio > LARGE_OFFSET
         lattice = Lattice.for_length(kernel, hyper.finest_length_m, wide)

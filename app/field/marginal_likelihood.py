@@ -45,7 +45,7 @@ class TileStatistics:
     """The sums over the s surveys of one tile that a likelihood needs, and the functions they were projected on.
 
     gram, target (m, c), energy (c,), log_det_shape, count: totals. offsets (m, s), ones (s,), ones_target (s, c):
-    of every offset of every survey.
+    of every offset of every survey. sources (m, m): of a potential, the divergence where somebody walked.
     """
 
     basis: Basis
@@ -57,6 +57,7 @@ class TileStatistics:
     offsets: Array
     ones: Array
     ones_target: Array
+    sources: Array | None = None
 
     @classmethod
     def of(cls, basis: Basis, surveys: Collection[SurveyStatistics]) -> "TileStatistics":
@@ -71,6 +72,7 @@ class TileStatistics:
             offsets=np.hstack([s.offsets for s in surveys]),
             ones=np.concatenate([s.ones for s in surveys]),
             ones_target=np.vstack([s.ones_target for s in surveys]),
+            sources=None if one.sources is None else np.sum([np.asarray(s.sources) for s in surveys], axis=0),
         )
 
 
@@ -98,15 +100,22 @@ class MostLikely(NamedTuple):
 class _Prior(NamedTuple):
     """sd (m,) of the weights over the signal's; derivatives (k, m) of their log variance with the kernel's parameters:
 
-    k is 1, or 3 of a sum.
+    k is 1, or 3 of a sum. source_variance: of the divergence in air, over the signal's; source_slopes (k,): of its
+    logarithm.
     """
 
     sd: Array
     log_slopes: Array
+    source_variance: float
+    source_slopes: Array
 
     @classmethod
     def of(cls, hyper: Hyperparameters, basis: Basis) -> "_Prior":
-        return cls(hyper.prior_sd(basis), _log_slopes(hyper, basis))
+        sd, slopes = hyper.prior_sd(basis), _log_slopes(hyper, basis)
+        if not basis.potential:
+            return cls(sd, slopes, 0.0, np.zeros(len(slopes)))
+        share = np.square(sd * basis.frequencies_squared)
+        return cls(sd, slopes, hyper.source_variance_ratio(basis), slopes @ share / max(share.sum(), 1e-300))
 
 
 @dataclass(slots=True)
@@ -188,13 +197,15 @@ def _hyperparameters(kernel: Kernel, log_parameters: Array) -> Hyperparameters:
 def _log_slopes(hyper: Hyperparameters, basis: Basis) -> Array:
     """(1, m), or (3, m) of a sum."""
     by_term = weight_variance(hyper.terms, basis)
-    share = by_term / by_term.sum(axis=0)
+    total = by_term.sum(axis=0)
+    share = np.divide(by_term, total, out=np.zeros_like(by_term), where=total > 0.0)  # of the finest it may vanish
     slopes = np.stack(
         [
             log_spectral_slope(kernel, basis.frequencies_squared, length_m, basis.dimensions, basis.potential)
             for kernel, length_m, _ in hyper.terms
         ]
     )
+    slopes[:, basis.frequencies_squared == 0.0] *= 1.0 - basis.potential  # long waves have no length
     both: Array = np.sum(share * slopes, axis=0)
     if len(share) == 1:
         return both[None]
@@ -214,6 +225,10 @@ def _tile_terms(tile: TileStatistics, hyper: Hyperparameters, prior: _Prior) -> 
     precision = tile.gram.scaled(tile.basis, root / np.sqrt(white))
     precision = dgemm(-1.0 / white, offsets * shrink, offsets, 1.0, precision, trans_b=1, overwrite_c=1)
     np.einsum("ii->i", precision)[:] += 1.0
+    air = None
+    if tile.sources is not None:
+        air = Gram(tile.sources, of_moments=False).scaled(tile.basis, root / np.sqrt(prior.source_variance))
+        precision += air
     factor, info = dpotrf(precision, lower=1, clean=1, overwrite_a=1)
     assert info == 0, info
     inverse = inverse_of_lower(factor)
@@ -230,7 +245,7 @@ def _tile_terms(tile: TileStatistics, hyper: Hyperparameters, prior: _Prior) -> 
     energy_by_shrink = -np.square(tile.ones_target - offsets.T @ z) / white
     log_det_by_shrink = -np.sum(np.square(inverse @ offsets), axis=0) / white
     energy_by_bias, log_det_by_bias = shrink_slope @ energy_by_shrink, shrink_slope @ log_det_by_shrink
-    return _Terms(
+    terms = _Terms(
         energy=(energy - explained) / white,
         log_det=float(log_det) + tile.log_det_shape,
         energy_slope=np.stack(
@@ -251,3 +266,28 @@ def _tile_terms(tile: TileStatistics, hyper: Hyperparameters, prior: _Prior) -> 
         ),
         count=tile.count,
     )
+    return terms if air is None else _given_air(terms, prior, air, inverse, z)
+
+
+def _given_air(terms: _Terms, prior: _Prior, air: Array, inverse: Array, z: Array) -> _Terms:
+    """The same of what was measured given that the divergence in air is nothing: `p(y | 0) = p(y, 0) / p(0)`.
+
+    air (m, m): what is known of the scaled weights from air alone, its lower triangle; inverse (m, m) of the factor
+    of the precision from both, and its weights z (m, c).
+    """
+    both = np.tril(air) + np.tril(air, -1).T
+    of_weights = np.einsum("mc,mc->c", z, both @ z)
+    known = float(np.sum((inverse @ both) * inverse))
+    factor, info = dpotrf(both + np.eye(len(both)), lower=1, clean=1, overwrite_a=1)
+    assert info == 0, info
+    alone = inverse_of_lower(factor)
+    variance = np.einsum("ij,ij->j", alone, alone)
+    known_alone = len(alone) - float(variance.sum())
+    by_kernel = prior.log_slopes @ (1.0 - variance) + prior.source_slopes * (known - known_alone)
+    kernel = [0, *range(3, len(terms.log_det_slope))]
+    terms.log_det -= 2.0 * float(np.sum(np.log(np.diagonal(factor))))
+    terms.energy_slope[1] += of_weights
+    terms.energy_slope[kernel] -= np.outer(prior.source_slopes, of_weights)
+    terms.log_det_slope[1] += known
+    terms.log_det_slope[kernel] -= by_kernel
+    return terms

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from app.field.estimate import FieldEstimate
 from app.field.observations import Walk, walk_bounds
-from app.field.raster import GridFrame
+from app.field.raster import TOUCHING_M, GridFrame, reachable
 from app.field.tiles import REACH_M
 from app.geometry import Array
 
@@ -24,23 +24,28 @@ def measured_cells(
 ) -> NDArray[np.bool_]:
     """(nz, ny, nx): within REACH_M of an observation, and latent sd at most MAX_SD_OF_PRIOR of the prior's.
 
-    Heights count where the field was fitted in three dimensions; else it is taken to be the same at all of them.
+    A plane, whose field is the same at all heights, holds for layers within REACH_M of any observation. In three
+    dimensions only what was observed as near above or below counts, or, of a potential, half as near or on both sides.
     """
     position_m = np.concatenate([walk.position_m for walk in walks])
     reach_m = max(REACH_M, resolution_m)
-    near = [
-        _near_columns(frame, position_m[layer], resolution_m, reach_m)
-        for layer in _by_layer(frame, position_m[:, 2], estimate)
-    ]
+
+    def near(observed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return _near_columns(frame, position_m[observed], resolution_m, reach_m)
+
+    z_m, up_m = position_m[:, 2], estimate.reach_up_m
+    layers = np.zeros(frame.shape, dtype=np.bool_)
+    for layer in np.flatnonzero(reachable(frame.heights_m, z_m, up_m)):
+        above_m = z_m - frame.heights_m[layer]
+        if len(estimate.gradient_uT_per_m) == 2:
+            layers[layer] = near(np.ones(len(z_m), dtype=np.bool_))
+            continue
+        layers[layer] = near(np.abs(above_m) <= up_m + TOUCHING_M)
+        if up_m < REACH_M:
+            between = [near((side_m >= 0.0) & (side_m <= REACH_M + TOUCHING_M)) for side_m in (above_m, -above_m)]
+            layers[layer] |= between[0] & between[1]
     known = estimate.variance_ratio.mean(axis=0) <= MAX_SD_OF_PRIOR**2
-    return np.asarray(np.stack(near) & known)
-
-
-def _by_layer(frame: GridFrame, z_m: Array, estimate: FieldEstimate) -> list[NDArray[np.bool_]]:
-    """For every layer the observations (n,) that count for it."""
-    if len(estimate.gradient_uT_per_m) == 2:
-        return [np.ones(len(z_m), dtype=np.bool_)] * len(frame.heights_m)
-    return [np.abs(z_m - height_m) <= REACH_M for height_m in frame.heights_m]
+    return np.asarray(layers & known)
 
 
 def _near_columns(frame: GridFrame, position_m: Array, resolution_m: float, reach_m: float) -> NDArray[np.bool_]:

@@ -6,16 +6,27 @@ from types import EllipsisType
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.errors import InvalidInput
 from app.field.blending import add_cells
 from app.field.hilbert import Patch
 from app.field.observations import Walk
 from app.field.spec import MapSpec
-from app.field.tiles import Lattice, Tile
+from app.field.tiles import POTENTIAL_REACH_UP_M, REACH_M, Lattice, Tile
 from app.geometry import Array
 
-__all__ = ["Blended", "GridFrame", "blend", "layer_heights_m", "placed", "tile_cells"]
+__all__ = [
+    "Blended",
+    "GridFrame",
+    "blend",
+    "layer_heights_m",
+    "on_all_layers",
+    "placed",
+    "reach_up_m",
+    "reachable",
+    "tile_cells",
+]
 
 MAX_CELLS = 20_000_000
 MAX_MARGIN_M = 3.0
@@ -57,10 +68,42 @@ class GridFrame:
 
 
 def layer_heights_m(walks: Sequence[Walk], spec: MapSpec) -> Array:
-    """(nz,) the heights asked for, or the one median height of the observations."""
-    if spec.heights_m is not None:
-        return np.array(spec.heights_m, dtype=np.float64)
-    return np.array([np.median(np.concatenate([walk.position_m[:, 2] for walk in walks]))])
+    """(nz,) the heights asked for, or the one median height of the observations.
+
+    Raises InvalidInput when none of those asked for is within reach of an observation.
+    """
+    z_m = np.concatenate([walk.position_m[:, 2] for walk in walks])
+    if spec.heights_m is None:
+        return np.array([np.median(z_m)])
+    asked_m = np.array(spec.heights_m, dtype=np.float64)
+    if not reachable(asked_m, z_m, reach_up_m(spec)).any():
+        raise InvalidInput(
+            f"the surveys were taken between {z_m.min():.2f} and {z_m.max():.2f} m, and no layer of heights_m "
+            f"({', '.join(f'{height_m:g}' for height_m in asked_m)} m) is within {reach_up_m(spec):g} m of them: ask "
+            "for heights near the surveys', in the building's frame"
+        )
+    return asked_m
+
+
+def reach_up_m(spec: MapSpec) -> float:
+    """How far above and below the surveys a map is believed."""
+    return POTENTIAL_REACH_UP_M if spec.curl_free else REACH_M
+
+
+def reachable(layers_m: Array, z_m: Array, up_m: float) -> NDArray[np.bool_]:
+    """(nz,) layers that are within REACH_M of an observed height, and not farther than up_m above or below all."""
+    near = np.array([np.abs(z_m - height_m).min() <= REACH_M + TOUCHING_M for height_m in layers_m])
+    past_m = np.maximum(z_m.min() - layers_m, layers_m - z_m.max())
+    return np.asarray(near & (past_m <= up_m + TOUCHING_M))
+
+
+def on_all_layers(values: Array, answered: NDArray[np.bool_], elsewhere: float) -> Array:
+    """(..., nz, ny, nx) of values (..., answered, ny, nx), which are the same on all other layers."""
+    if answered.all():
+        return values
+    everywhere = np.full((*values.shape[:-3], len(answered), *values.shape[-2:]), elsewhere)
+    everywhere[..., answered, :, :] = values
+    return everywhere
 
 
 def tile_cells(lattice: Lattice, axis: int, tile: Tile, resolution_m: float) -> Array:

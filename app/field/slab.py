@@ -4,7 +4,9 @@ Functions are products of cosines (Neumann walls, like `app.field.basis`) on a b
 frequencies. A field component is their sum; or the functions are of a scalar potential and the field is minus its
 gradient, `B = -grad phi`: then the three components share one set of weights, the field has no curl, and its
 divergence is `-laplace phi`. Walls would force a potential's normal field to zero, so its box is larger than the tile
-by a padding, and taller than the surveys (a thin one is wrong by several uT along the vertical).
+by a padding, and taller than the surveys (a thin one is wrong by several uT along the vertical). Between walls there is
+no uniform field either, and a potential of short length has hardly any: what is longer than the box, which steel far
+away makes, is a few harmonic polynomials more, fields that are uniform or change linearly.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +19,24 @@ from numpy.typing import NDArray
 from app.geometry import Array
 
 __all__ = ["SlabBasis"]
+
+_X, _Y, _Z = np.eye(3)
+
+
+def _symmetric(a: Array, b: Array) -> Array:
+    return np.asarray(np.outer(a, b) + np.outer(b, a))
+
+
+_UNIFORM = np.concatenate([np.eye(3), np.zeros((5, 3))])
+_LINEAR = np.sqrt(0.9) * np.stack(
+    [
+        *np.zeros((3, 3, 3)),
+        *(_symmetric(a, b) for a, b in ((_X, _Y), (_X, _Z), (_Y, _Z))),
+        np.diag([1.0, -1.0, 0.0]),
+        np.diag([-1.0, -1.0, 2.0]) / np.sqrt(3.0),
+    ]
+)
+"""Long waves: the field `g + A r`, r from the middle in half sides of the box; without curl or sources, isotropic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +63,32 @@ class SlabBasis:
 
     @property
     def size(self) -> int:
-        return len(self.orders)
+        return len(self.orders) + self.long_waves
+
+    @property
+    def about_size(self) -> float:
+        """The size, from the volume and surface of the box, before anything is made of it."""
+        k, edges_m = self.cutoff_rad_per_m, 2.0 * self.side_m + self.depth_m
+        surface = 2.0 * self.side_m * (self.side_m + 2.0 * self.depth_m)
+        return float(
+            self.volume * k**3 / (6.0 * np.pi**2) + surface * k**2 / (16.0 * np.pi) + edges_m * k / (4.0 * np.pi)
+        )
+
+    @property
+    def long_waves(self) -> int:
+        """How many of the functions, the last ones, are longer than the box."""
+        return len(_UNIFORM) if self.potential else 0
 
     @property
     def orders(self) -> NDArray[np.int64]:
-        """(m, 3) half waves of every function along x, y and z; of a potential the constant is left out."""
+        """(m - long waves, 3) half waves of every cosine along x, y and z; of a potential the constant is left out."""
         return _orders(self.side_m, self.depth_m, self.cutoff_rad_per_m, self.potential)
 
     @property
     def frequencies_squared(self) -> Array:
-        """(m,) eigenvalues of minus the Laplacian, (rad/m)^2."""
-        return np.asarray(np.sum(np.square(np.pi / np.array(self._sides) * self.orders), axis=1))
+        """(m,) eigenvalues of minus the Laplacian, (rad/m)^2; of long waves zero."""
+        cosines = np.sum(np.square(np.pi / np.array(self._sides) * self.orders), axis=1)
+        return np.concatenate([cosines, np.zeros(self.long_waves)])
 
     @property
     def rows_per_point(self) -> int:
@@ -68,16 +103,24 @@ class SlabBasis:
         values, slopes, _ = self._along_all(points_m)
         if not self.potential:
             return np.asarray(self._products(values)[None])
-        return -np.stack([self._products([*values[:k], slopes[k], *values[k + 1 :]]) for k in range(3)])
+        cosines = -np.stack([self._products([*values[:k], slopes[k], *values[k + 1 :]]) for k in range(3)])
+        linear = np.einsum("hab,nb->anh", _LINEAR, self._from_middle(points_m))
+        return np.concatenate([cosines, _UNIFORM.T[:, None] + linear], axis=2)
 
     def divergence_rows(self, points_m: Array) -> Array:
         """(n, m) what every weight of a potential adds to the divergence of the field at points (n, 3)."""
         values, _, _ = self._along_all(points_m)
-        return self._products(values) * self.frequencies_squared
+        cosines = self._products(values)
+        return np.pad(cosines, ((0, 0), (0, self.long_waves))) * self.frequencies_squared
 
     def at(self, points_m: Array) -> Array:
         """(n, m) values of all functions at points (n, 3)."""
-        return self._products(self._along_all(points_m)[0])
+        cosines = self._products(self._along_all(points_m)[0])
+        if not self.potential:
+            return cosines
+        r = self._from_middle(points_m)
+        long = r @ _UNIFORM.T + 0.5 * np.einsum("na,hab,nb->nh", r, _LINEAR, r)
+        return np.concatenate([cosines, -0.5 * self.side_m * long], axis=1)
 
     def on_lattice(self, weights: Array, x_m: Array, y_m: Array, z_m: Array) -> tuple[Array, Array, Array]:
         """For weights (m, c), at heights, rows and columns: the functions' sum (c, nz, ny, nx), the field
@@ -86,7 +129,7 @@ class SlabBasis:
         """
         tables = [self._along(axis, at) for axis, at in enumerate((x_m, y_m, z_m))]
         table = np.zeros((weights.shape[1], *(t[0].shape[1] for t in tables)))
-        table[:, self.orders[:, 0], self.orders[:, 1], self.orders[:, 2]] = weights.T
+        table[:, self.orders[:, 0], self.orders[:, 1], self.orders[:, 2]] = weights[: len(self.orders)].T
 
         def derived(*axes: int) -> Array:
             """(c, nz, ny, nx) of the functions, derived once along each of these axes."""
@@ -98,7 +141,21 @@ class SlabBasis:
         field = np.concatenate([-derived(axis) for axis in range(3)])
         second = {(i, j): -derived(i, j) for i, j in product(range(3), repeat=2) if i <= j}
         gradient = np.stack([np.concatenate([second[min(i, j), max(i, j)] for j in range(3)]) for i in range(3)])
-        return derived(), field, gradient
+        long_potential, long_field, long_gradient = self._long_waves(weights[len(self.orders) :, 0], x_m, y_m, z_m)
+        return derived() + long_potential, field + long_field, gradient + long_gradient[..., None, None, None]
+
+    def _long_waves(self, weights: Array, x_m: Array, y_m: Array, z_m: Array) -> tuple[Array, Array, Array]:
+        """Of weights (8,): potential (nz, ny, nx), field (3, nz, ny, nx) and the field's gradient (3, 3)."""
+        z, y, x = np.meshgrid(z_m, y_m, x_m, indexing="ij")
+        r = self._from_middle(np.stack([x, y, z], axis=-1))
+        uniform, linear = weights @ _UNIFORM, np.tensordot(weights, _LINEAR, axes=1)
+        potential = -0.5 * self.side_m * np.sum(r * (uniform + 0.5 * r @ linear), axis=-1)
+        return potential, np.moveaxis(uniform + r @ linear, -1, 0), 2.0 / self.side_m * linear
+
+    def _from_middle(self, points_m: Array) -> Array:
+        """(..., 3) in half sides of the box."""
+        middle_m = np.array(self.corner_m) + 0.5 * np.array(self._sides)
+        return np.asarray((points_m - middle_m) / (0.5 * self.side_m))
 
     @property
     def _sides(self) -> tuple[float, float, float]:

@@ -25,7 +25,7 @@ from app.field.slab import SlabBasis
 from app.field.walk_noise import WHITE, WalkNoise, whiten
 from app.geometry import Array
 
-AIR_EVERY_M = 0.3
+AIR_EVERY_M = 0.15
 
 __all__ = ["Evidence", "Gram", "SurveyStatistics", "add_evidence", "marginalise", "survey_statistics"]
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from app.errors import InvalidInput
 from app.field.basis import CosineBasis
 from app.field.blending import weights
 from app.field.hyperparameters import Basis
@@ -21,7 +22,18 @@ from app.field.slab import SlabBasis
 from app.field.spec import BaseKernel, Kernel
 from app.geometry import Array
 
-__all__ = ["FUNCTIONS_PER_AXIS", "MARGIN", "OVERLAP", "PITCHES_M", "REACH_M", "Lattice", "Slab", "Tile"]
+__all__ = [
+    "FUNCTIONS_PER_AXIS",
+    "MARGIN",
+    "OVERLAP",
+    "PITCHES_M",
+    "POTENTIAL_REACH_UP_M",
+    "REACH_M",
+    "Heights",
+    "Lattice",
+    "Slab",
+    "Tile",
+]
 
 PITCHES_M = (
     *(1.0, 1.12, 1.25, 1.4, 1.6, 1.8, 2.0, 2.24, 2.5, 2.8, 3.15, 3.55, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0),
@@ -43,8 +55,17 @@ BORDER_POINTS = 9
 ROOM_M = 0.5
 """The heights of a slab are rounded outwards to this, so that the next survey fits in."""
 
+AIR_BEYOND_M = 0.1
+"""Above and below what was walked there is air as well, a hand's breadth of it."""
+
 REACH_M = 1.0
 """Farther than a metre from any sample a map of a building is a guess: steel a metre away bends the field that fast."""
+
+
+POTENTIAL_REACH_UP_M = 0.5
+"""Above and below what was walked the field of a potential is continued, and errors grow much faster than sideways."""
+MAX_FUNCTIONS = 3000
+"""In a box: their matrices take 70 MB a survey, and a second to solve."""
 
 
 class _SlabShape(NamedTuple):
@@ -64,8 +85,15 @@ _SLABS: dict[BaseKernel, _SlabShape] = {
 _POTENTIAL_SLABS: dict[BaseKernel, _SlabShape] = {
     "squared_exponential": _SlabShape(2.5, 1.0, 2.0, 4.5),
     "matern52": _SlabShape(1.5, 0.7, 1.2, 8.0),
-    "matern32": _SlabShape(1.2, 0.7, 1.2, 10.0),
+    "matern32": _SlabShape(1.2, 0.7, 1.2, 8.0),
 }
+
+
+class Heights(NamedTuple):
+    """Lowest and highest: of what was walked, and of what the functions must hold, layers included."""
+
+    walked_m: tuple[float, float]
+    held_m: tuple[float, float]
 
 
 class Tile(NamedTuple):
@@ -79,7 +107,7 @@ class Tile(NamedTuple):
 class Slab:
     """The boxes of a lattice of slabs, for a field between the heights `inner_m`: `headroom_m` taller on either side,
 
-    `padding_m` wider than their tile on every side. air_m: the heights of surveys and layers, rounded to inner_m.
+    `padding_m` wider than their tile on every side. air_m: the heights of the surveys, and a little more.
     """
 
     air_m: tuple[float, float]
@@ -109,15 +137,28 @@ class Lattice:
         return cls(_pitch_m(pitch_in_lengths[base] * length_m), functions_per_axis=functions[base])
 
     @classmethod
-    def of_slabs(cls, kernel: Kernel, length_m: float, heights_m: tuple[float, float], potential: bool) -> "Lattice":
-        """The same, of boxes for a field between two heights."""
+    def of_slabs(
+        cls,
+        kernel: Kernel,
+        length_m: float,
+        walked_m: tuple[float, float],
+        potential: bool,
+        held_m: tuple[float, float] | None = None,
+    ) -> "Lattice":
+        """The same, of boxes for a field walked between two heights, and wanted between two others.
+
+        Raises InvalidInput for boxes that are too tall.
+        """
         shape = (_POTENTIAL_SLABS if potential else _SLABS)[base_kernel(kernel)]
-        low_m, high_m = heights_m
+        low_m, high_m = held_m or walked_m
+        air_m = walked_m[0] - AIR_BEYOND_M, walked_m[1] + AIR_BEYOND_M
         inner_m = (float(np.floor(low_m / ROOM_M) * ROOM_M), float(np.ceil(high_m / ROOM_M) * ROOM_M))
         slab = Slab(
-            heights_m, inner_m, shape.headroom * length_m, shape.padding * length_m, shape.cutoff / length_m, potential
+            air_m, inner_m, shape.headroom * length_m, shape.padding * length_m, shape.cutoff / length_m, potential
         )
-        return cls(_pitch_m(shape.pitch * length_m), margin=POTENTIAL_MARGIN if potential else MARGIN, slab=slab)
+        lattice = cls(_pitch_m(shape.pitch * length_m), margin=POTENTIAL_MARGIN if potential else MARGIN, slab=slab)
+        _check_size(lattice.basis(Tile(0, 0)), walked_m)
+        return lattice
 
     def basis(self, tile: Tile) -> Basis:
         """The functions a tile is fitted with, on its core and margin."""
@@ -173,6 +214,15 @@ class Lattice:
         cells, index, bounds = cell_members(points_m, self.pitch_m, reach)
         places = zip(cells.tolist(), pairwise(bounds), strict=True)
         return {Tile(*cell): index[start:stop] for cell, (start, stop) in places}
+
+
+def _check_size(basis: Basis, walked_m: tuple[float, float]) -> None:
+    assert isinstance(basis, SlabBasis)
+    if basis.about_size > MAX_FUNCTIONS:
+        raise InvalidInput(
+            f"a map of surveys between {walked_m[0]:.1f} and {walked_m[1]:.1f} m would take {basis.about_size:.0f} "
+            f"functions a tile, more than {MAX_FUNCTIONS}: build one map of each level, by survey_ids"
+        )
 
 
 def _pitch_m(least_m: float) -> float:

@@ -51,7 +51,8 @@ def gradient_along(grid: FieldGrid, position_m: Array) -> Array:
     not measured."""
     cells = (position_m[:, :2] - np.asarray(grid.origin_m)) / grid.resolution_m
     layer = np.interp(position_m[:, 2], grid.heights_m, np.arange(len(grid.heights_m), dtype=np.float64))
-    return np.asarray(_gradient_along(grid.gradient_uT_per_m, grid.measured, cells, layer))
+    along = _gradient_along(grid.gradient_uT_per_m, grid.measured, cells, layer)
+    return np.where(grid.between_layers(position_m), along, np.nan)
 
 
 def _of_survey(samples: Samples, held_out: HeldOut, grid: FieldGrid) -> WalkLocalizability | None:

@@ -35,8 +35,9 @@ from app.survey.read import read_survey
 from app.survey.walk import DeadReckoning, Walk
 
 __all__ = [
-    "EvaluatedFloor", "Evaluation", "EvaluationPlan", "JudgedWindow", "Place", "calibrate_sessions", "cut_windows",
-    "evaluate_walks", "hold_out",
+    "HELD_OUT_EVERY", "NOISES", "EvaluatedFloor", "Evaluation", "EvaluationPlan", "JudgedWindow", "Place", "Told",
+    "calibrate_sessions", "collected", "cut_windows", "evaluate_walks", "hold_out", "on_one_thread", "read_floors",
+    "session_of",
 ]  # fmt: skip
 
 HELD_OUT_EVERY = 5
@@ -134,7 +135,7 @@ class Evaluation:
 
 def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluation:
     """Evaluate the floors under `directory`. Raises InvalidInput when there is nothing to evaluate."""
-    floors, unreadable = _read_floors(directory, told)
+    floors, unreadable = read_floors(directory, told)
     if plan.rehearse:
         floors = {floor_id: {name: walks[name] for name in hold_out(walks)[0]} for floor_id, walks in floors.items()}
     spec = replace(plan.spec, hard_iron=plan.session_bias)
@@ -143,13 +144,13 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
     if plan.session_bias:
         biases = {floor_id: estimate_session_biases(samples) for floor_id, samples in mapping.items()}
         floors = {floor_id: calibrate_sessions(walks, biases[floor_id] or {}) for floor_id, walks in floors.items()}
-    with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=on_one_thread) as pool:
         fits = {
             pool.submit(_fit_floor, samples, replace(spec, noise=noise)): (floor_id, noise)
             for floor_id, samples in mapping.items()
             for noise in NOISES
         }
-        by_noise = dict(_collected(fits, told, "fitting maps"))
+        by_noise = dict(collected(fits, told, "fitting maps"))
     fitted = {floor_id: by_noise[floor_id, plan.spec.noise] for floor_id in floors}
     tasks = [
         (floor_id, name, floors[floor_id][name], _mapped_places(floors[floor_id]))
@@ -158,7 +159,7 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
     ]
     arguments = ({floor_id: each.grid for floor_id, each in fitted.items()}, plan)
     with ProcessPoolExecutor(plan.processes, get_context("spawn"), _ready_to_locate, arguments) as pool:
-        judged = dict(_collected({pool.submit(_judge_walk, *task): task[:2] for task in tasks}, told, "locating"))
+        judged = dict(collected({pool.submit(_judge_walk, *task): task[:2] for task in tasks}, told, "locating"))
     return Evaluation(
         floors=tuple(
             _evaluated_floor(floor_id, walks, fitted[floor_id], by_noise[floor_id, "white"], biases[floor_id])
@@ -169,10 +170,10 @@ def evaluate_walks(directory: Path, plan: EvaluationPlan, told: Told) -> Evaluat
     )
 
 
-def hold_out(walks: Mapping[str, object]) -> tuple[list[str], list[str]]:
-    """(names to map, names held out): every fifth in order of name is held out."""
+def hold_out(walks: Mapping[str, object], fold: int = HELD_OUT_EVERY - 1) -> tuple[list[str], list[str]]:
+    """(names to map, names held out): every fifth in order of name is held out, from the fifth or another on."""
     names = sorted(walks)
-    held_out = names[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
+    held_out = names[fold::HELD_OUT_EVERY]
     return [name for name in names if name not in set(held_out)], held_out
 
 
@@ -229,7 +230,8 @@ def _turned(v: Array, angle_rad: Array) -> Array:
     return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
 
 
-def _read_floors(directory: Path, told: Told) -> tuple[dict[str, dict[str, Walk]], dict[str, str]]:
+def read_floors(directory: Path, told: Told) -> tuple[dict[str, dict[str, Walk]], dict[str, str]]:
+    """Floor -> name -> walk, and what could not be read and why. Raises InvalidInput when there is nothing."""
     files = [
         (folder.name, file)
         for folder in sorted(path for path in directory.iterdir() if path.is_dir())
@@ -270,14 +272,16 @@ def _walk_bytes(file: Path) -> bytes:
     return data
 
 
-def _collected(futures: Mapping[Future[Any], Any], told: Told, stage: str) -> Iterator[tuple[Any, Any]]:
+def collected(futures: Mapping[Future[Any], Any], told: Told, stage: str) -> Iterator[tuple[Any, Any]]:
+    """(key, result) of every future, as they come."""
     told(stage, 0, len(futures))
     for done, future in enumerate(as_completed(futures), start=1):
         yield futures[future], future.result()
         told(stage, done, len(futures))
 
 
-def _one_thread() -> None:
+def on_one_thread() -> None:
+    """BLAS, in a child process."""
     threadpool_limits(1)
 
 
@@ -293,7 +297,7 @@ _plan = EvaluationPlan()
 def _ready_to_locate(grids: Mapping[str, Any], plan: EvaluationPlan) -> None:
     """Once per child process: the floors ready for searching, together and each alone."""
     global _plan
-    _one_thread()
+    on_one_thread()
     _floors[:] = prepare_floors(grids)
     _floor_alone.update((floor_id, prepare_floor(floor_id, grid)) for floor_id, grid in grids.items())
     _plan = plan
@@ -365,7 +369,7 @@ def _evaluated_floor(
 
     def against(grid: FieldGrid) -> list[HeldOutWalk]:
         samples = [walks[name].samples for name in held_out]
-        return [held_out_walk(grid, each, mapped_m, _session_of(each, biases)) for each in samples]
+        return [held_out_walk(grid, each, mapped_m, session_of(each, biases)) for each in samples]
 
     judged, judged_white = against(fitted.grid), against(white.grid)
     return EvaluatedFloor(
@@ -382,7 +386,7 @@ def _evaluated_floor(
     )
 
 
-def _session_of(samples: Samples, biases: Mapping[str, BodyBias] | None) -> BodyBias | None:
+def session_of(samples: Samples, biases: Mapping[str, BodyBias] | None) -> BodyBias | None:
     """What is known of the walk's session; None where nothing was taken out of any."""
     if biases is None or samples.session is None or samples.q_body_to_building is None:
         return None

@@ -261,6 +261,7 @@ def test_a_compromise_map_on_request_says_how_near_it_is(service: Any, mapped_fl
     [
         {"curl_free": True, "engine": "exact"},
         {"curl_free": True, "components": "norm"},
+        {"kernel": "matern32+matern32", "curl_free": True},
         {"heights_m": [2.0, 1.0]},
         {"kernel": "matern32+matern32", "engine": "exact"},
         {"robust": True, "engine": "exact"},

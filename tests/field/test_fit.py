@@ -217,5 +217,5 @@ def test_a_level_walk_cannot_give_a_vector_map(walks):
 
 
 def test_a_single_height_is_where_the_layer_lies(walks):
-    assert fit_map(walks, MapSpec(resolution_m=0.5, heights_m=(1.2,))).grid.heights_m.tolist() == [1.2]
+    assert fit_map(walks, MapSpec(resolution_m=0.5, heights_m=(0.8,))).grid.heights_m.tolist() == [0.8]
     assert fit_map(walks, SPEC).grid.heights_m.tolist() == [0.0]

@@ -47,10 +47,12 @@ def test_a_map_of_one_height_ignores_z() -> None:
     assert grid.at(np.array([[1.0, 1.0]])).mean_uT[0] == low
 
 
-def test_beyond_the_layers_the_nearest_answers() -> None:
-    grid = plane_grid((1.0, 3.0))
-    beyond = grid.at(np.array([[1.0, 1.0, 9.0], [1.0, 1.0, 3.0]])).mean_uT
-    assert beyond[0] == beyond[1]
+def test_above_and_below_the_layers_nothing_is_measured() -> None:
+    z = [0.98, 0.995, 1.0, 3.0, 3.005, 3.02, 9.0]
+    values = plane_grid((1.0, 3.0)).at(np.array([[1.0, 1.0, each] for each in z]))
+    assert values.measured.tolist() == [False, True, True, True, True, False, False]
+    np.testing.assert_array_equal(values.mean_uT[[0, 5, 6]], np.full((3, 1), 48.0))
+    np.testing.assert_array_equal(values.sd_uT[[0, 5, 6]], np.full((3, 1), 6.0))
 
 
 def test_outside_is_the_prior_and_not_measured() -> None:

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from app.field.basis import CosineBasis
+from app.field.hyperparameters import Hyperparameters
 from app.field.kernels import spectral_density
 from app.field.marginal_likelihood import TileStatistics, learn, negative_log_likelihood
 from app.field.slab import SlabBasis
@@ -107,3 +108,34 @@ def test_a_constant_field_is_learned_without_dividing_by_zero():
     found = learn([flat], "matern32", WHITE)
     assert np.isfinite(found.nats)
     assert found.hyper.signal_sd_uT[0] < 0.1
+
+
+def test_a_potential_is_learned_given_the_air_it_was_measured_in():
+    """The dense density of what was measured and of the divergences, over that of the divergences alone."""
+    basis = SlabBasis((0.0, 0.0, -1.0), 8.0, 3.0, 1.8, potential=True, air_m=(0.0, 0.4))
+    p, y, path = walks(WHITE, components=3)[0]
+    points = np.column_stack([p, np.full(len(p), 0.2)])
+    survey = survey_statistics(basis, points, y, path, WHITE)
+    likelihood = negative_log_likelihood(
+        [TileStatistics.of(basis, [survey])], "squared_exponential", np.log([1.8, 0.05, 1e-8])
+    )
+    hyper = Hyperparameters("squared_exponential", 1.8, np.ones(1), 0.05)
+    air = points.copy()
+    air[:, 2] = np.resize(np.linspace(0.0, 0.4, 4), len(air))
+    rows = np.concatenate([*basis.rows(points), basis.divergence_rows(air)]) * hyper.prior_sd(basis)
+    n = 3 * len(points)
+    error = np.repeat([0.05, hyper.source_variance_ratio(basis)], [n, len(air)])
+    covariance = likelihood.signal_variance_uT2[0] * (rows @ rows.T + np.diag(error))
+    both = multivariate_normal(cov=covariance).logpdf(np.concatenate([y.T.ravel(), np.zeros(len(air))]))
+    alone = multivariate_normal(cov=covariance[n:, n:]).logpdf(np.zeros(len(air)))
+    assert likelihood.value == pytest.approx(alone - both, rel=1e-4)
+
+
+def test_lengths_at_which_functions_vanish_have_a_finite_slope():
+    basis = SlabBasis((0.0, 0.0, 0.0), 8.0, 3.0, 4.0, potential=True)
+    p, _, path = walks(WHITE)[0]
+    points = np.column_stack([p, np.full(len(p), 1.2)])
+    tiles = [TileStatistics.of(basis, [survey_statistics(basis, points, np.zeros((len(p), 3)), path, WHITE)])]
+    assert np.all(
+        np.isfinite(negative_log_likelihood(tiles, "squared_exponential", np.log([20.0, 0.05, 1e-8])).gradient)
+    )

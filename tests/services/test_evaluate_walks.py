@@ -13,6 +13,7 @@ from app.cli import evaluate as command
 from app.errors import InvalidInput
 from app.field.samples import Samples
 from app.field.session_bias import estimate_session_biases
+from app.services.cross_validate_maps import cross_validate_maps
 from app.services.evaluate_walks import (
     Evaluation,
     EvaluationPlan,
@@ -149,6 +150,29 @@ def test_every_fifth_walk_by_name_is_held_out():
     mapping, held_out = hold_out(dict.fromkeys("kjihgfedcba"))
     assert held_out == ["e", "j"]
     assert mapping == list("abcdfghik")
+
+
+def test_folds_hold_every_walk_out_once():
+    names = dict.fromkeys("kjihgfedcba")
+    held_out = [name for fold in range(5) for name in hold_out(names, fold)[1]]
+    assert sorted(held_out) == sorted(names)
+
+
+def test_every_walk_judges_the_maps_once(building):
+    found = cross_validate_maps(building, EvaluationPlan(processes=1), lambda *_: None)
+    assert [floor.floor_id for floor in found.floors] == ["F0", "F1", "all"]
+    first, second, everything = found.floors
+    assert first.held_out.walks == second.held_out.walks == 6
+    assert everything.held_out.samples == first.held_out.samples + second.held_out.samples
+    assert max(everything.held_out.rmse_ut) < 4.0
+    assert np.isfinite(everything.nlpd_gain_over_white.value)
+
+
+def test_the_command_judges_maps_alone_when_asked(building):
+    result = CliRunner().invoke(_application(), [str(building), "--maps", "--processes", "1"])
+    assert result.exit_code == 0, result.output
+    assert "held-out walks" in result.output
+    assert "Floors and status" not in result.output
 
 
 def reckoned(n=400, heading_0=0.4):
