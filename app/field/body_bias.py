@@ -37,6 +37,8 @@ LENGTHS_M = (1.0, 2.0, 4.0, 8.0)
 LABEL_SD_M, LABEL_CORRELATION_M = 0.3, 5.0
 WHITE_RATIO = 1e-3
 PRIOR_SD_UT = 10.0
+PRIOR_VERTICAL_SD_UT = 2.6
+"""Along the vertical nothing is learned: what is left there is as expected of a session (`session_bias`)."""
 _ITERATIONS = 4
 
 
@@ -81,7 +83,9 @@ def estimate_body_bias(samples: Samples) -> BodyBias | None:
         return None
     across = _across_vertical(walk.rotation)
     best = min((_fit(walk, across, length_m) for length_m in LENGTHS_M), key=lambda fit: fit.nats)
-    return BodyBias(across @ best.mean_uT, across @ best.covariance_uT2 @ across.T)
+    along = np.cross(across[:, 0], across[:, 1])
+    unseen_uT2 = PRIOR_VERTICAL_SD_UT**2 * np.outer(along, along)
+    return BodyBias(across @ best.mean_uT, across @ best.covariance_uT2 @ across.T + unseen_uT2)
 
 
 def remove_body_bias(samples: Samples, bias: BodyBias) -> Samples:

@@ -48,10 +48,10 @@ def quality_layers(
 
 
 def _squared_error(walk: Walk, held_out: HeldOut) -> Array:
-    """(n,) squared error of every observation in predictive variances, mean over components; NaN where not judged."""
+    """(n,) mean squared error of the samples of every observation in predictive variances; NaN where not judged."""
     z, stretch = held_out.standardised, walk.stretch_of_sample[held_out.judged]
-    z, _ = means_of_places(z, stretch, np.ones(len(z), dtype=np.bool_), len(walk))
-    return np.asarray(np.mean(np.square(z), axis=1))
+    squared, _ = means_of_places(np.square(z), stretch, np.ones(len(z), dtype=np.bool_), len(walk))
+    return np.asarray(np.mean(squared, axis=1))
 
 
 def _layer(x_m: Array, y_m: Array, points: Sequence[Array], errors: Sequence[Array]) -> tuple[Array, Array]:

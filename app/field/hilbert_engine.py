@@ -15,6 +15,7 @@ from app.field.continuation import in_terms_of, spread_uT, with_continuation
 from app.field.estimate import FieldEstimate, ambient_field_uT
 from app.field.hard_iron import Cleaned
 from app.field.held_out_choice import choose_by_held_out_surveys
+from app.field.interpolation import interpolation_ratio
 from app.field.learning import learn
 from app.field.leave_one_out import HeldOutPrediction
 from app.field.observations import Walk
@@ -140,6 +141,8 @@ def _estimate(
     blended = _blend(lattice, replace(frame, heights_m=layers_m[answered]), spec, tiles)
     components = len(learned.ambient_uT)
     prior_sd_uT, error_sd_uT = (np.broadcast_to(sd, components) for sd in (hyper.signal_sd_uT, hyper.error_sd_uT))
+    coarse = interpolation_ratio(hyper.finest_length_m, spec.resolution_m)
+    blended = blended._replace(variance_ratio=np.minimum(blended.variance_ratio + coarse, 1.0))
     variance_ratio, held_out_ratio = blended.variance_ratio, predicted.variance_ratio
     if spec.curl_free:
         prior_sd_uT = spread_uT(walks, learned.ambient_uT)

@@ -15,6 +15,8 @@ from app.geometry import Array
 
 __all__ = ["MAX_SD_OF_PRIOR", "measured_cells", "near_observations", "near_other_walks"]
 
+MOST_AT_ONE_PLACE = 25
+"""Somebody who walks takes about ten at 50 Hz within the 20 cm of an observation."""
 MAX_SD_OF_PRIOR = 0.9
 """A cell whose sd is above this share of the prior's has had less than a fifth of its variance explained."""
 
@@ -60,9 +62,23 @@ def _near_columns(frame: GridFrame, position_m: Array, resolution_m: float, reac
 
 
 def near_other_walks(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[np.bool_]]:
-    """Survey id -> (N,) samples whose observation is near another survey, as `near_observations`."""
+    """Survey id -> (N,) samples whose observation is near another survey, as `near_observations`.
+
+    Of a long stand at one place the first MOST_AT_ONE_PLACE samples: more are the same error again.
+    """
     near = near_observations(walks, volume)
-    return {walk.survey_id: near[walk.survey_id][walk.stretch_of_sample] for walk in walks}
+    return {walk.survey_id: _of_samples(near[walk.survey_id], walk.stretch_of_sample) for walk in walks}
+
+
+@njit(cache=True)
+def _of_samples(near: NDArray[np.bool_], stretch_of_sample: NDArray[np.int64]) -> NDArray[np.bool_]:
+    chosen, place, count = np.zeros(len(stretch_of_sample), dtype=np.bool_), -1, 0
+    for i in range(len(stretch_of_sample)):
+        if stretch_of_sample[i] != place:
+            place, count = stretch_of_sample[i], 0
+        count += 1
+        chosen[i] = near[place] and count <= MOST_AT_ONE_PLACE
+    return chosen
 
 
 def near_observations(walks: Sequence[Walk], volume: bool) -> dict[str, NDArray[np.bool_]]:

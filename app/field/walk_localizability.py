@@ -16,6 +16,9 @@ from app.geometry import Array
 
 __all__ = ["add_localizability", "gradient_along", "walk_localizability"]
 
+MOST_SAMPLES = 2000
+"""Of longer walks every second, third, ... sample says as much."""
+
 
 def add_localizability(
     reports: Mapping[str, ConsistencyReport],
@@ -57,6 +60,7 @@ def gradient_along(grid: FieldGrid, position_m: Array) -> Array:
 
 def _of_survey(samples: Samples, held_out: HeldOut, grid: FieldGrid) -> WalkLocalizability | None:
     judged = np.flatnonzero(held_out.judged)
+    judged = judged[:: 1 + len(judged) // MOST_SAMPLES]
     gradient = gradient_along(grid, samples.p_building_m[judged])
     seen = np.isfinite(gradient)
     if np.count_nonzero(seen) < MIN_JUDGED:

@@ -42,7 +42,7 @@ def test_nothing_is_said_along_the_vertical_however_the_sensor_is_held(make_room
     found = estimate_body_bias(walk)
     up_body = np.array([0.0, np.sin(tilt_rad), np.cos(tilt_rad)])
     assert abs(found.bias_body_uT @ up_body) < 1e-9
-    assert abs(up_body @ found.covariance_uT2 @ up_body) < 1e-9
+    assert up_body @ found.covariance_uT2 @ up_body == pytest.approx(body_bias.PRIOR_VERTICAL_SD_UT**2)
 
 
 def test_turning_building_and_sensor_together_turns_nothing_in_the_body_frame(room):
