@@ -34,17 +34,20 @@ FLAT_M = 0.8
 """Walks whose heights (5th to 95th percentile) differ by less are taken to be at one height."""
 DISCREDITED = 10.0
 """A survey this many times noisier than the others says nothing of the ambient field, nor of the next one's errors."""
-
-
 NOISE_ROUNDS = 2
 """How often the noise of single surveys is learned, and everything else with it; most maps need none."""
 
 
 class _Fit(NamedTuple):
-    """The tiles of a lattice, what they were fitted with, and every walk predicted from the others."""
+    """The tiles of a lattice, what they were fitted with, and every walk predicted from the others.
+
+    answered (nz,): layers the tiles hold; coarse_ratio: variance, over the signal's, that the grid loses between cells.
+    """
 
     learned: Learned
     frame: GridFrame
+    answered: NDArray[np.bool_]
+    coarse_ratio: float
     tiles: dict[Tile, TileFit]
     predicted: HeldOutPrediction
 
@@ -94,6 +97,7 @@ def _fit_tiles(
 ) -> _Fit:
     """One tile after the other; those of `kept` that the same surveys cross are taken as they are."""
     frame = GridFrame.around(walks, spec.resolution_m, learned.hyper.length_m, layers_m)
+    coarse_ratio = interpolation_ratio(learned.hyper.finest_length_m, spec.resolution_m)
     answered = _answered(walks, spec, layers_m)
     tiled = TiledWalks(learned.lattice, walks, learned.ambient_uT)
     tiles: dict[Tile, TileFit] = {}
@@ -107,7 +111,7 @@ def _fit_tiles(
     predicted = HeldOutPrediction(learned.lattice, walks, len(next(iter(tiles.values())).patch.variance_ratio))
     for tile, fit in tiles.items():
         predicted.add(tile, tiled.all_answered(tile), fit.held_out)
-    return _Fit(learned, frame, tiles, predicted)
+    return _Fit(learned, frame, answered, coarse_ratio, tiles, predicted)
 
 
 def _with_noise_of_new(fit: _Fit, walks: Sequence[Walk]) -> Learned:
@@ -135,14 +139,12 @@ def _estimate(
     continued: bool,
     old: Mapping[Tile, TileFit],
 ) -> FieldEstimate:
-    learned, frame, tiles, predicted = fit
+    learned, frame, answered, coarse_ratio, tiles, predicted = fit
     lattice, hyper = learned.lattice, learned.hyper
-    answered = _answered(walks, spec, layers_m)
     blended = _blend(lattice, replace(frame, heights_m=layers_m[answered]), spec, tiles)
     components = len(learned.ambient_uT)
     prior_sd_uT, error_sd_uT = (np.broadcast_to(sd, components) for sd in (hyper.signal_sd_uT, hyper.error_sd_uT))
-    coarse = interpolation_ratio(hyper.finest_length_m, spec.resolution_m)
-    blended = blended._replace(variance_ratio=np.minimum(blended.variance_ratio + coarse, 1.0))
+    blended = blended._replace(variance_ratio=np.minimum(blended.variance_ratio + coarse_ratio, 1.0))
     variance_ratio, held_out_ratio = blended.variance_ratio, predicted.variance_ratio
     if spec.curl_free:
         prior_sd_uT = spread_uT(walks, learned.ambient_uT)
