@@ -11,10 +11,12 @@ from app.field.compromise_engine import estimate_by_compromise
 from app.field.conflict import quality_layers
 from app.field.consistency import check_surveys
 from app.field.drift import out_of_date_regions
+from app.field.error_structure import ErrorStructure
 from app.field.estimate import FieldEstimate
 from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
 from app.field.hard_iron import Cleaned, HardIron, remove_hard_iron
+from app.field.held_out_structure import held_out_structure
 from app.field.hilbert_engine import estimate_by_hilbert
 from app.field.kernels import base_kernel, is_sum
 from app.field.leave_one_out import HeldOut, error_correlation_m, score
@@ -86,7 +88,7 @@ def fit_map(
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
     names, frame = COMPONENT_NAMES[spec.components], estimate.frame
-    grid = _grid(observed, estimate, spec, noise_sd_uT, correlation_m)
+    grid = _grid(observed, estimate, spec, noise_sd_uT, correlation_m, held_out_structure(held_out))
     reports = check_surveys(held_out, names, correlation_m)
     about_labels = {"refinement": refinement.as_json()} if refinement else {}
     return FittedMap(
@@ -167,7 +169,12 @@ def _held_out(
 
 
 def _grid(
-    walks: Sequence[Walk], estimate: FieldEstimate, spec: MapSpec, noise_sd_uT: Array, correlation_m: float
+    walks: Sequence[Walk],
+    estimate: FieldEstimate,
+    spec: MapSpec,
+    noise_sd_uT: Array,
+    correlation_m: float,
+    structure: ErrorStructure,
 ) -> FieldGrid:
     """Layers of cells, cells first and components last."""
     frame = estimate.frame
@@ -185,6 +192,7 @@ def _grid(
         prior_sd_uT=np.ascontiguousarray(estimate.prior_sd_uT),
         noise_sd_uT=noise_sd_uT,
         error_correlation_m=correlation_m,
+        error_structure=structure,
     )
 
 

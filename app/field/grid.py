@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from app.field.error_structure import UNKNOWN_STRUCTURE, ErrorStructure
 from app.field.samples import COMPONENT_NAMES, Components
 from app.geometry import Array
 
@@ -40,7 +41,8 @@ class FieldGrid:
     ambient_uT, prior_sd_uT (c,): what the field is taken to be where nothing was measured
     noise_sd_uT (c,): learned sd of one further measurement about the latent field (all error terms together)
     error_correlation_m: distance walked over which errors against the map stay correlated (from leave-one-survey-out
-        residuals); 0 when unknown. A window's effective sample size follows from it.
+        residuals); 0 when unknown
+    error_structure: how those errors hang together; what a window is worth follows from it
     """
 
     components: Components
@@ -55,6 +57,7 @@ class FieldGrid:
     prior_sd_uT: Array
     noise_sd_uT: Array
     error_correlation_m: float = 0.0
+    error_structure: ErrorStructure = UNKNOWN_STRUCTURE
 
     def __post_init__(self) -> None:
         nz, ny, nx, c = self.mean_uT.shape

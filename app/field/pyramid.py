@@ -27,8 +27,8 @@ _Cells = TypeVar("_Cells", Float32, Codes)
 class Level:
     """Bounds over squares of `side` cells: that at (j, i) is in record [(j + base) // step, (i + base) // step].
 
-    records   (h, w, 2 c + ceil(c / 2)) float32: c lower then c upper bounds of the mean, uT, then, byte by byte, the
-              ladder positions at or below (c) and at or above (c) every variance in the square
+    records   (h, w, 2 c + 1) float32: c lower then c upper bounds of the mean, uT, then, as two bytes, the ladder
+              positions at or below and at or above every variance in the square
     step      cells between records, a power of two; base = side + step. Indices beyond the array: the nearest record
     """
 
@@ -43,7 +43,7 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """levels[l - 1] holds squares of 2^l cells; ladder_uT2 (c, LADDER_STEPS) ascends from the smallest variance."""
+    """levels[l - 1] holds squares of 2^l cells; ladder_uT2 (LADDER_STEPS,) ascends from the smallest variance."""
 
     levels: tuple[Level, ...]
     ladder_uT2: Array
@@ -54,16 +54,16 @@ class Pyramid:
 
 
 def variance_ladder(variance_uT2: Array | Float32) -> Array:
-    """(c, LADDER_STEPS) logarithmic ladder from the smallest to the largest variance of each component."""
-    flat = variance_uT2.reshape(-1, variance_uT2.shape[-1]).astype(np.float64)
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    ladder = low[:, None] * (high / low)[:, None] ** np.linspace(0.0, 1.0, LADDER_STEPS)
-    ladder[:, -1] = high
+    """(LADDER_STEPS,) logarithmic ladder from the smallest to the largest variance."""
+    low, high = float(variance_uT2.min()), float(variance_uT2.max())
+    ladder = low * (high / low) ** np.linspace(0.0, 1.0, LADDER_STEPS)
+    ladder[-1] = high
     return np.asarray(ladder)
 
 
 def build_pyramid(mean_uT: Float32, variance_uT2: Float32, levels: int) -> Pyramid:
-    """Levels 1 to `levels` of a field (ny + 2, nx + 2, c) that already carries one cell of prior on each side."""
+    """Levels 1 to `levels` of a field (ny + 2, nx + 2, c) and its variance (ny + 2, nx + 2), which already carry one
+    cell of prior on each side."""
     ladder = variance_ladder(variance_uT2)
     bounds, codes = np.concatenate([mean_uT, mean_uT], axis=2), _codes(variance_uT2.astype(np.float64), ladder)
     built = []
@@ -77,20 +77,18 @@ def build_pyramid(mean_uT: Float32, variance_uT2: Float32, levels: int) -> Pyram
 
 def _records(bounds: Float32, codes: Codes) -> Float32:
     c = bounds.shape[2] // 2
-    records = np.zeros((*bounds.shape[:2], 2 * c + (c + 1) // 2), dtype=np.float32)
+    records = np.zeros((*bounds.shape[:2], 2 * c + 1), dtype=np.float32)
     records[..., : 2 * c] = bounds
-    records.view(np.uint8)[..., 8 * c : 10 * c] = codes
+    records.view(np.uint8)[..., 8 * c : 8 * c + 2] = codes
     return records
 
 
 def _codes(variance: Array, ladder: Array) -> Codes:
-    """(ny, nx, 2 c) ladder positions at or below, and at or above, each variance."""
-    c = ladder.shape[0]
-    codes = np.zeros((*variance.shape[:2], 2 * c), dtype=np.uint8)
-    for k in range(c):
-        if ladder[k, 0] < ladder[k, -1]:
-            codes[..., k] = np.searchsorted(ladder[k], variance[..., k], side="right") - 1
-            codes[..., c + k] = np.searchsorted(ladder[k], variance[..., k], side="left")
+    """(ny, nx, 2) ladder positions at or below, and at or above, each variance."""
+    codes = np.zeros((*variance.shape, 2), dtype=np.uint8)
+    if ladder[0] < ladder[-1]:
+        codes[..., 0] = np.searchsorted(ladder, variance, side="right") - 1
+        codes[..., 1] = np.searchsorted(ladder, variance, side="left")
     return codes
 
 

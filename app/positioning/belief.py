@@ -5,12 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.geometry import Array
-from app.positioning.fix import LocateOptions
-from app.positioning.lattice import turn_window
 from app.positioning.matching import Matched
 from app.positioning.off_map import off_map
 from app.positioning.posterior import Atoms, cell_atoms, find_modes, replace_narrow_mode, untold_variance_m2
-from app.positioning.refine import Refined, refine_poses
+from app.positioning.refine import POSE, PoseGaussian, Refined, refine_poses
+from app.positioning.scoring import pose_residuals
 
 __all__ = ["Belief", "BelievedMode", "believe"]
 
@@ -20,13 +19,14 @@ _HEAVY_POSES = 2000  # enough poses to judge how much of the window was measured
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BelievedMode:
-    """One mode: its refined pose (x, y, heading of the window's frame), and mass relative to all poses on maps."""
+    """One mode: its refined pose (x, y, heading half-way, scale less one, drift), and mass relative to all on maps."""
 
     plane: int
     pose: Array
     log_l: float
     distance2: float
     probability: float
+    refined: Refined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,19 +49,20 @@ class Belief:
     missed: float
 
 
-def believe(matched: Matched, options: LocateOptions) -> Belief:
-    """Sum, refine and normalise the candidates' tempered posterior."""
-    found = matched.candidates
-    relative = np.exp((found.score - found.score[0]) / matched.temper)
+def believe(matched: Matched) -> Belief:
+    """Sum, refine and normalise the candidates' posterior."""
+    found, options = matched.candidates, matched.options
+    relative = np.exp(matched.score - matched.score[0])
     cell = np.array([plane.resolution_m for plane in matched.planes])
     untold = untold_variance_m2(matched.window.from_last_m)
     atoms = cell_atoms(found.plane, found.row, found.column, matched.position_m, relative, cell[found.plane], untold)
-    members = find_modes(found.plane, matched.position_m, found.score, options.mlr_min_distance_m, _MODES)
+    members = find_modes(found.plane, matched.position_m, matched.score, options.mlr_min_distance_m, _MODES)
     peaks = [int(group[0]) for group in members]
-    refined = [_refine(matched, peak) for peak in peaks]
+    gaussian = pose_gaussian(matched)
+    refined = [_refine(matched, gaussian, peak) for peak in peaks]
     for peak, fine in zip(peaks, refined, strict=True):
         plane = int(found.plane[peak])
-        mass = _laplace_mass(matched, plane, fine)
+        mass = _laplace_mass(matched, gaussian, plane, fine)
         atoms = replace_narrow_mode(
             atoms, plane, fine.pose[0, :2], fine.covariance[0, :2, :2], mass, float(cell[plane]), untold
         )
@@ -69,7 +70,7 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
     share = _mode_masses(atoms, [(int(found.plane[k]), r.pose[0, :2]) for k, r in zip(peaks, refined, strict=True)],
                          options.mlr_min_distance_m) / total  # fmt: skip
     modes = [
-        BelievedMode(int(found.plane[k]), r.pose[0], float(r.log_l[0]), float(r.distance2[0]), float(s))
+        BelievedMode(int(found.plane[k]), r.pose[0], float(r.log_l[0]), float(r.distance2[0]), float(s), r)
         for k, r, s in zip(peaks, refined, share, strict=True)
     ]
     elsewhere = off_map(matched)
@@ -83,29 +84,56 @@ def believe(matched: Matched, options: LocateOptions) -> Belief:
         unmapped=nowhere + (1.0 - nowhere) * poor,
         off_map_distance2=elsewhere.distance2,
         off_map_scalars=elsewhere.scalars,
-        missed=found.missed_mass / (found.missed_mass + total),
+        missed=_missed(matched, total),
     )
 
 
-def _refine(matched: Matched, candidate: int) -> Refined:
-    found, plane = matched.candidates, int(matched.candidates.plane[candidate])
-    heading = matched.headings_rad[found.heading[candidate]]
-    start = np.array([[*matched.position_m[candidate], heading]])
+def _missed(matched: Matched, total: float) -> float:
+    """The share of the posterior the search left out, at most, as it is searched: with inflated variances."""
+    searched = np.exp(matched.candidates.score - matched.candidates.score.max())
+    return matched.candidates.missed_mass / (matched.candidates.missed_mass + float(searched.sum()))
+
+
+def pose_gaussian(matched: Matched) -> PoseGaussian:
+    """The prior of a pose, for refinement."""
+    window, prior, options = matched.asked, matched.pose_prior, matched.options
+    mean, precision, free = np.zeros(POSE), np.zeros(POSE), np.ones(POSE)
+    if prior.position_m is not None:
+        mean[:2], precision[:2] = prior.position_m[:2], prior.sd_m**-2
+    fixed = window.frame == "building" or (window.heading_rad is not None and not window.heading_sd_rad)
+    if window.heading_rad is not None and window.heading_sd_rad and not fixed:
+        mean[2], precision[2] = window.heading_rad, window.heading_sd_rad**-2
+    free[2] = 0.0 if fixed else 1.0
+    for k, sd in ((3, options.step_scale_sd), (4, 0.0 if fixed else options.heading_drift_sd_rad_per_m)):
+        if sd > 0.0 and len(matched.window) > 1:
+            precision[k] = sd**-2
+        else:
+            free[k] = 0.0
+    return PoseGaussian(mean, precision, free)
+
+
+def _refine(matched: Matched, gaussian: PoseGaussian, candidate: int) -> Refined:
+    found, courses, plane = matched.candidates, matched.courses, int(matched.candidates.plane[candidate])
+    k = int(found.course[candidate])
+    course = courses.heading_rad[k], courses.scale[k] - 1.0, courses.drift_rad_per_m[k]
+    start = np.array([[*matched.position_m[candidate], *course]])
     floor = matched.floors[matched.plane_floor[plane]]
-    return refine_poses(
-        floor, matched.planes[plane], matched.window, start, matched.gaussian, matched.temper, matched.demeaned
-    )
+    return refine_poses(floor, matched.planes[plane], matched.window, start, gaussian, matched.error)
 
 
-def _laplace_mass(matched: Matched, plane: int, refined: Refined) -> float:
-    """The mode's mass in units of the best pose of the lattice, as if the lattice were infinitely fine."""
-    free = matched.gaussian.free.astype(bool)
+def _laplace_mass(matched: Matched, gaussian: PoseGaussian, plane: int, refined: Refined) -> float:
+    """The mode's mass in units of the best pose of the lattice, as if the lattice were infinitely fine.
+
+    A heading of the lattice weighs exp(log prior), a scale or a drift what its prior holds: their priors have a constant.
+    """
+    free = gaussian.free.astype(bool)
     covariance = refined.covariance[0][np.ix_(free, free)]
-    step = abs(matched.headings_rad[1] - matched.headings_rad[0]) if free[2] else 1.0
+    step = matched.courses.steps.heading_rad if free[2] else 1.0
     volume = matched.planes[plane].resolution_m ** 2 * step
-    height = _height_log(matched, plane)
-    peak = np.exp(np.clip((refined.objective[0] - matched.candidates.score[0]) / matched.temper + height, -700, 700))
-    return float(peak * np.sqrt(np.linalg.det(2 * np.pi * covariance)) / volume)
+    told = float(np.sum(np.log(2.0 * np.pi / gaussian.precision[3:][free[3:]])))
+    log_volume = 0.5 * float(np.linalg.slogdet(2 * np.pi * covariance)[1]) - 0.5 * told - np.log(volume)
+    peak = refined.objective[0] - matched.score[0] + _height_log(matched, plane) + log_volume
+    return float(np.exp(np.clip(peak, -700, 700)))
 
 
 def _height_log(matched: Matched, plane: int) -> float:
@@ -135,14 +163,8 @@ def _poorly_measured(matched: Matched, relative: Array) -> float:
     poor = 0.0
     for k, plane in enumerate(matched.planes):
         here = heavy[found.plane[heavy] == k]
-        if not len(here):
-            continue
-        turned = turn_window(matched.window, matched.headings_rad, plane.resolution_m)
-        cells = (
-            np.stack([found.row[here], found.column[here]], axis=1)[:, None] + turned.offset_cells[found.heading[here]]
-        )
-        ny, nx = plane.shape
-        inside = (cells >= 0).all(axis=2) & (cells[..., 0] < ny) & (cells[..., 1] < nx)
-        known = inside & plane.measured[cells[..., 0].clip(0, ny - 1), cells[..., 1].clip(0, nx - 1)]
-        poor += float(relative[here][known.mean(axis=1) < 0.5].sum())
+        if len(here):
+            poses = found.course[here], found.row[here], found.column[here]
+            known = pose_residuals(plane, matched.turned[k], poses)[2]
+            poor += float(relative[here][known.mean(axis=1) < 0.5].sum())
     return poor / float(relative[heavy].sum())

@@ -1,7 +1,11 @@
 """A fix: what is believed after a window was matched against the maps of some floors."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from app.geometry import Array
 
@@ -12,13 +16,26 @@ Status = Literal["fix", "ambiguous", "inconsistent", "unmapped"]
 
 @dataclass(frozen=True, slots=True)
 class LocateOptions:
-    """Parameters of the techniques (Shockley 8.2, 8.3) and of the gate."""
+    """Parameters of the techniques (Shockley 8.2, 8.3), of the gate, and what is known of the window's errors.
+
+    bias_sd_uT                   what is not known of the sensor's constant offset, per axis, beyond what surveys of the
+                                 map differ by
+    step_scale_sd                relative sd of the scale of the window's displacements
+    heading_drift_sd_rad_per_m   sd of the drift of the window's heading, per metre walked
+    walkable                     (floor id, x_m (nx,), y_m (ny,)) -> (ny, nx) where the device may be now; None: anywhere
+    out_of_time                  asked now and then; once it says so the search ends with what it has
+    """
 
     mlr_ratio: float = 2.0
     mlr_min_distance_m: float = 5.0
     abl_threshold: float | None = None  # None: the default of techniques.py, as a multiple of the uniform mass
     abl_bin_m: float = 2.0
     gate_probability: float = 0.997  # chi-square gate on the best pose (Shockley 8.5)
+    bias_sd_uT: float = 1.0
+    step_scale_sd: float = 0.05
+    heading_drift_sd_rad_per_m: float = 0.003
+    walkable: Callable[[str, Array, Array], NDArray[np.bool_]] | None = None
+    out_of_time: Callable[[], bool] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,8 @@ from app.geometry import Array
 from app.positioning.features import reduce_field, reduce_variance
 
 __all__ = [
-    "TOP_LEVEL", "Plane", "SearchableFloor", "prepare_floor", "prepare_floors", "reduce_floor", "shared_noise_sd_uT",
+    "TOP_LEVEL", "Plane", "SearchableFloor", "feature_scale", "prepare_floor", "prepare_floors", "reduce_floor",
+    "shared_noise_sd_uT",
 ]  # fmt: skip
 
 TOP_LEVEL = 5  # the search starts from blocks of 2^5 cells
@@ -24,10 +25,15 @@ Float32 = NDArray[np.float32]
 class Plane:
     """One layer of a floor's grid, as features.
 
-    mean_uT, variance_uT2  (ny + 2, nx + 2, c): the field and the variance of one measurement about it (map sd and the
-                           floor's noise together), one cell of prior on each side; unmeasured cells hold the prior
+    mean_uT                (ny + 2, nx + 2, c) features of the field times `scale`, one cell of prior on each side;
+                           unmeasured cells hold the prior
+    variance_uT2           (ny + 2, nx + 2) variance of one measurement about them (map sd and the floor's noise
+                           together): one figure for all components, which `scale` makes alike
     measured               (ny, nx)
-    ambient_uT, off_map_variance_uT2   (c,) the same where there is no map
+    scale                  (c,) factor of each component: the horizontal ones keep their microteslas, the vertical is
+                           stretched to their noise
+    ambient_uT, off_map_variance_uT2   (c,) and a number: the same where there is no map
+    typical_variance_uT2   median variance over the measured cells
     gradient_uT_per_m      rms gradient of the features over the measured cells
     """
 
@@ -37,8 +43,10 @@ class Plane:
     mean_uT: Float32
     variance_uT2: Float32
     measured: NDArray[np.bool_]
+    scale: Array
     ambient_uT: Array
-    off_map_variance_uT2: Array
+    off_map_variance_uT2: float
+    typical_variance_uT2: float
     gradient_uT_per_m: float
     pyramid: Pyramid
 
@@ -116,13 +124,16 @@ def _prepare(floor_id: str, grid: FieldGrid, components: Components, noise_sd_uT
 def _plane(grid: FieldGrid, layer: int, components: Components, noise_sd_uT: Array) -> Plane:
     source, measured = grid.components, grid.measured[layer]
     noise = np.square(noise_sd_uT)
+    scale = feature_scale(reduce_variance(grid.ambient_uT, noise, source, components), components)
     mean = np.where(measured[..., None], grid.mean_uT[layer], grid.ambient_uT).astype(np.float64)
     sd = np.where(measured[..., None], grid.sd_uT[layer], grid.prior_sd_uT).astype(np.float64)
-    variance = reduce_variance(mean, np.square(sd) + noise, source, components)
-    ambient = reduce_field(grid.ambient_uT, source, components)
-    off_map = reduce_variance(grid.ambient_uT, np.square(grid.prior_sd_uT) + noise, source, components)
-    features = _padded(reduce_field(mean, source, components), ambient)
-    spread = _padded(np.maximum(variance, 1e-6), np.maximum(off_map, 1e-6))
+    variance = _alike(reduce_variance(mean, np.square(sd) + noise, source, components), scale)
+    ambient = scale * reduce_field(grid.ambient_uT, source, components)
+    off_map = float(_alike(reduce_variance(grid.ambient_uT, np.square(grid.prior_sd_uT) + noise, source, components),
+                           scale))  # fmt: skip
+    features = _padded(scale * reduce_field(mean, source, components), ambient)
+    spread = _padded(variance, off_map)
+    known = variance[measured]
     return Plane(
         height_m=float(grid.heights_m[layer]),
         origin_m=grid.origin_m,
@@ -130,16 +141,32 @@ def _plane(grid: FieldGrid, layer: int, components: Components, noise_sd_uT: Arr
         mean_uT=features,
         variance_uT2=spread,
         measured=measured,
+        scale=scale,
         ambient_uT=ambient,
-        off_map_variance_uT2=np.maximum(off_map, 1e-6),
+        off_map_variance_uT2=off_map,
+        typical_variance_uT2=float(np.median(known)) if len(known) else off_map,
         gradient_uT_per_m=_rms_gradient(grid, layer),
         pyramid=build_pyramid(features, spread, TOP_LEVEL),
     )
 
 
-def _padded(cells: Array, prior: Array) -> Float32:
-    ny, nx, c = cells.shape
-    padded = np.empty((ny + 2, nx + 2, c), dtype=np.float32)
+def feature_scale(noise_uT2: Array, components: Components) -> Array:
+    """(c,) factors that give every component the noise of the horizontal ones, from variances (c,)."""
+    if components == "norm":
+        return np.ones(1)
+    horizontal = float(np.mean(noise_uT2[:-1]))
+    vertical = float(np.sqrt(max(horizontal, 1e-6) / max(float(noise_uT2[-1]), 1e-6)))
+    return np.append(np.ones(len(noise_uT2) - 1), vertical)
+
+
+def _alike(variance_uT2: Array, scale: Array) -> Array:
+    """(...) one variance for all scaled components: the mean of theirs (..., c)."""
+    return np.asarray(np.maximum(np.mean(np.square(scale) * variance_uT2, axis=-1), 1e-6))
+
+
+def _padded(cells: Array, prior: Array | float) -> Float32:
+    ny, nx, *c = cells.shape
+    padded = np.empty((ny + 2, nx + 2, *c), dtype=np.float32)
     padded[:] = prior
     padded[1:-1, 1:-1] = cells
     return padded

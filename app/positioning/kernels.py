@@ -1,14 +1,16 @@
 """Compiled inner loops of the search: the cost of a pose and the bound of a block of poses.
 
-cost = -2 log L + constant = sum_i sum_c [(z_ic - m_ic)^2 / v_ic + log(v_ic / v_min,c)] + prior terms. With a constant
-offset b integrated out under a flat prior (demeaned), per component
-    cost_c = min_b sum_i (r_i - b)^2 / v_i + sum_i log(v_i / v_min,i) + log sum_i (v_ref / v_i),     r_i = z_i - m_i.
+cost = -2 log L + constant = sum_i [|z_i - m_i|^2 / (f v_i) + c log(v_i / v_min)] + prior terms, v_i the variance of the
+cell and the sensor, f the inflation that stands for errors alike along the walk. With a constant offset b of the sensor
+integrated out under a Gaussian prior of precision p (zero: flat), and residuals r_i turned to the sensor's axes,
+    min_b sum_i |r_i - b|^2 / (f v_i) + p |b|^2  =  sum w_i |r_i|^2 - |sum w_i r_i|^2 / (sum w_i + p),   w_i = 1 / (f v_i),
+and a term c log(sum w_i + p).
 
-A block holds 2^l x 2^l poses of one heading. Its bound takes for every sample the interval of the map over the
-displaced block: the squared distance of the sample to that interval, at the variance of the block's range that makes
-the term smallest. Every operation is monotone, so the bound of a block never exceeds the cost of a pose in it.
-Demeaned, the intervals of r_i shift together: the smallest sum of squared distances to them over one common offset is
-a convex problem in one unknown, and a tangent certifies its value from below.
+A block holds 2^l x 2^l poses of one course. Without an offset its bound takes for every sample the squared distance to
+the box of map values over the displaced block, at the variance of the block's range that makes the term smallest: every
+operation is monotone. With an offset the boxes shift together, so the bound takes residuals from the middles of the
+boxes: the root of the cost above is a seminorm, no larger than that of the plain weighted sum, so by the triangle
+inequality it falls short of the middle's by at most the root of the weighted sum of the boxes' squared half diagonals.
 """
 
 import math
@@ -22,15 +24,15 @@ _SLACK = 1e-9  # relative: what rounding may add to a bound
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _term(squared, low, high, ladder):  # type: ignore[no-untyped-def]
-    """Smallest squared / v + log(v / v_min) over the variances between two steps of `ladder` (steps, 2)."""
+def _term(squared, low, high, ladder, c):  # type: ignore[no-untyped-def]
+    """Smallest squared / v + c log(v / v_min) over the variances between two steps of `ladder` (steps, 2)."""
     v_high = ladder[high, 0]
-    if squared >= v_high:
+    if squared >= c * v_high:
         return squared / v_high + ladder[high, 1]
     v_low = ladder[low, 0]
-    if squared <= v_low:
+    if squared <= c * v_low:
         return squared / v_low + ladder[low, 1]
-    return 1.0 + math.log(squared / ladder[0, 0])
+    return c * (1.0 + math.log(squared / (c * ladder[0, 0])))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -42,115 +44,123 @@ def _record(j, i, base, shift, height, width):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _raw_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop):  # type: ignore[no-untyped-def]
+def _plain_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop):  # type: ignore[no-untyped-def]
     """`cost` plus the bound of the block at (j, i); given up as soon as it exceeds `stop`."""
     n, c = z.shape
     base, shift, height, width = level
     for k in range(n):
         at = _record(j + row[k], i + column[k], base, shift, height, width)
+        squared = 0.0
         for m in range(c):
             d = max(max(z[k, m] - records[at, c + m], records[at, m] - z[k, m]), 0.0)
-            cost += _term(d * d, codes[at, 8 * c + m], codes[at, 9 * c + m], ladder[kind[k], m])
+            squared += d * d
+        cost += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder[kind[k]], c)
         if cost > stop:
             return cost
     return cost
 
 
 @numba.njit(cache=True, nogil=True)
-def _raw_cost(ny, nx, j, i, z, row, column, noise, floor_variance, mean, variance, cost, stop):  # type: ignore[no-untyped-def]
+def _plain_cost(ny, nx, j, i, z, row, column, noise, floor_variance, inflation, mean, variance, cost, stop):  # type: ignore[no-untyped-def]
     """`cost` plus the cost of the pose at (j, i), given up beyond `stop`. Arrays carry one cell of prior around."""
     n, c = z.shape
     for k in range(n):
         a = min(max(j + row[k] + 1, 0), ny + 1)
         b = min(max(i + column[k] + 1, 0), nx + 1)
-        ratio = 1.0
+        squared = 0.0
         for m in range(c):
-            v = variance[a, b, m] + noise[k]
             r = z[k, m] - mean[a, b, m]
-            cost += r * r / v
-            ratio *= v / (floor_variance[m] + noise[k])
-        cost += math.log(ratio)
+            squared += r * r
+        v = variance[a, b] + noise[k]
+        cost += squared / (inflation * v) + c * math.log(v / (floor_variance + noise[k]))
         if cost > stop:
             return cost
     return cost
 
 
-@numba.njit(cache=True, nogil=True)
-def _least_spread(low, high, weight, n):  # type: ignore[no-untyped-def]
-    """A certified lower bound of min_b sum_k weight_k dist(b, [low_k, high_k])^2, tight to rounding."""
-    left, right = high[0], low[0]
-    for k in range(1, n):
-        left, right = min(left, high[k]), max(right, low[k])
-    if right <= left:  # one offset lies in every interval
-        return 0.0
-    offset, best = 0.5 * (left + right), 0.0
-    for _ in range(24):
-        value, slope, curvature = 0.0, 0.0, 0.0
-        for k in range(n):
-            d = max(offset - high[k], 0.0) - max(low[k] - offset, 0.0)
-            if d != 0.0:
-                value += weight[k] * d * d
-                slope += weight[k] * d
-                curvature += weight[k]
-        if slope > 0.0:
-            right = offset
-        else:
-            left = offset
-        best = max(best, value - 2.0 * abs(slope) * (right - left))
-        step = offset - slope / curvature if curvature > 0.0 else offset
-        if value - best <= 0.02 * value or abs(step - offset) <= 1e-12 * (1.0 + abs(offset)):
-            break
-        offset = step if left < step < right else 0.5 * (left + right)
-    return best
+@numba.njit(cache=True, nogil=True, inline="always")
+def _to_sensor(x, y, z, turn, tilt, k):  # type: ignore[no-untyped-def]
+    """Turn a residual to the sensor's axes: by the yaw of sample k, then by its tilt if it has one."""
+    x, y = turn[k, 0] * x + turn[k, 1] * y, turn[k, 0] * y - turn[k, 1] * x
+    if len(tilt):
+        return (
+            tilt[k, 0, 0] * x + tilt[k, 0, 1] * y + tilt[k, 0, 2] * z,
+            tilt[k, 1, 0] * x + tilt[k, 1, 1] * y + tilt[k, 1, 2] * z,
+            tilt[k, 2, 0] * x + tilt[k, 2, 1] * y + tilt[k, 2, 2] * z,
+        )
+    return x, y, z
 
 
 @numba.njit(cache=True, nogil=True)
-def _demeaned_bound(j, i, z, row, column, kind, ladder, level, records, codes, cost, stop, scratch):  # type: ignore[no-untyped-def]
-    """The bound of a block with an offset per component integrated out, compared with `stop` now and then."""
+def _offset_bound(  # type: ignore[no-untyped-def]
+    j, i, z, row, column, turn, tilt, kind, ladder, offset, level, records, codes, cost, stop
+):
+    """The bound of a block with an offset integrated out, compared with `stop` sample after sample.
+
+    Components that features of one or two do not have stay zero.
+    """
     n, c = z.shape
     base, shift, height, width = level
-    low, high, weight, ratios = scratch[0], scratch[1], scratch[2], scratch[3, :, 0]
-    logs = 0.0
-    ratios[:] = 0.0
-    check, total = 3, cost
+    gx, gy, gz, ry, rz, half_y, half_z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    squares, spread, total_weight = 0.0, 0.0, offset[1]
+    logs = cost + offset[3]
     for k in range(n):
         at = _record(j + row[k], i + column[k], base, shift, height, width)
-        for m in range(c):
-            steps = ladder[kind[k], m]
-            low[m, k], high[m, k] = z[k, m] - records[at, c + m], z[k, m] - records[at, m]
-            weight[m, k] = 1.0 / steps[codes[at, 9 * c + m], 0]
-            logs += steps[codes[at, 8 * c + m], 1]
-            ratios[m] += ladder[0, m, 0, 0] * weight[m, k]
-        if k + 1 == check or k + 1 == n:
-            check *= 2
-            total = cost + logs
-            for m in range(c):
-                total += _least_spread(low[m], high[m], weight[m], k + 1) + math.log(ratios[m])
-            if total > stop:
-                return total
-    return total
+        low, high = records[at, 0], records[at, c]
+        rx, half_x = z[k, 0] - 0.5 * (high + low), 0.5 * (high - low)
+        if c > 1:
+            low, high = records[at, 1], records[at, c + 1]
+            ry, half_y = z[k, 1] - 0.5 * (high + low), 0.5 * (high - low)
+        if c > 2:
+            low, high = records[at, 2], records[at, c + 2]
+            rz, half_z = z[k, 2] - 0.5 * (high + low), 0.5 * (high - low)
+        w = 1.0 / ladder[kind[k], codes[at, 8 * c + 1], 0]
+        logs += ladder[kind[k], codes[at, 8 * c], 1]
+        x, y, up = _to_sensor(rx, ry, rz, turn, tilt, k)
+        gx, gy, gz = gx + w * x, gy + w * y, gz + w * up
+        squares += w * (rx * rx + ry * ry + rz * rz)
+        spread += w * (half_x * half_x + half_y * half_y + half_z * half_z)
+        total_weight += w
+        room = stop - logs
+        if room < 0.0:
+            return logs
+        apart = squares - (gx * gx + gy * gy + gz * gz) / total_weight
+        if apart > spread + room + 2.0 * math.sqrt(spread * room):
+            short = math.sqrt(apart) - math.sqrt(spread)
+            return logs + short * short
+    logs += c * math.log(total_weight / offset[2]) - offset[3]
+    short = math.sqrt(max(squares - (gx * gx + gy * gy + gz * gz) / total_weight, 0.0)) - math.sqrt(spread)
+    return logs + short * short if short > 0.0 else logs
 
 
 @numba.njit(cache=True, nogil=True)
-def _demeaned_cost(ny, nx, j, i, z, row, column, noise, floor_variance, mean, variance, cost):  # type: ignore[no-untyped-def]
-    """`cost` plus the cost of a pose with an offset per component integrated out."""
+def _offset_cost(  # type: ignore[no-untyped-def]
+    ny, nx, j, i, z, row, column, turn, tilt, noise, floor_variance, inflation, offset, mean, variance, cost, stop
+):
+    """`cost` plus the cost of a pose with an offset integrated out, given up beyond `stop`."""
     n, c = z.shape
-    least_noise = noise.min()
-    for m in range(c):
-        sum_w, sum_wr, sum_wrr, ratio = 0.0, 0.0, 0.0, 0.0
-        for k in range(n):
-            a = min(max(j + row[k] + 1, 0), ny + 1)
-            b = min(max(i + column[k] + 1, 0), nx + 1)
-            v = variance[a, b, m] + noise[k]
-            r = z[k, m] - mean[a, b, m]
-            least = floor_variance[m] + noise[k]
-            sum_w += 1.0 / v
-            sum_wr += r / v
-            sum_wrr += r * r / v
-            ratio += (floor_variance[m] + least_noise) / v
-            cost += math.log(v / least)
-        cost += max(sum_wrr - sum_wr * sum_wr / sum_w, 0.0) + math.log(ratio)
-    return cost
+    gx, gy, gz, ry, rz = 0.0, 0.0, 0.0, 0.0, 0.0
+    squares, total_weight = 0.0, offset[1]
+    for k in range(n):
+        a = min(max(j + row[k] + 1, 0), ny + 1)
+        b = min(max(i + column[k] + 1, 0), nx + 1)
+        v = variance[a, b] + noise[k]
+        w = 1.0 / (inflation * v)
+        rx = z[k, 0] - mean[a, b, 0]
+        if c > 1:
+            ry = z[k, 1] - mean[a, b, 1]
+        if c > 2:
+            rz = z[k, 2] - mean[a, b, 2]
+        x, y, up = _to_sensor(rx, ry, rz, turn, tilt, k)
+        gx, gy, gz = gx + w * x, gy + w * y, gz + w * up
+        squares += w * (rx * rx + ry * ry + rz * rz)
+        total_weight += w
+        cost += c * math.log(v / (floor_variance + noise[k]))
+        apart = squares - (gx * gx + gy * gy + gz * gz) / total_weight
+        if cost + offset[3] + apart > stop:
+            return cost + offset[3] + apart
+    apart = squares - (gx * gx + gy * gy + gz * gz) / total_weight
+    return cost + max(apart, 0.0) + c * math.log(total_weight / offset[2])
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -163,42 +173,48 @@ def _distance_cost(j, i, side, prior):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def pose_costs(  # type: ignore[no-untyped-def]
-    poses, demeaned, z, row, column, noise, floor_variance, mean, variance, heading_cost, prior, stop
-):
-    """Costs (p,) of poses (p, 3) given as (heading, row, column); beyond `stop` only a lower bound of the cost."""
+    poses, offset, z, row, column, turn, tilt, noise, floor_variance, inflation, mean, variance, course_cost, prior,
+    stop
+):  # fmt: skip
+    """Costs (p,) of poses (p, 3) given as (course, row, column); beyond `stop` only a lower bound of the cost.
+
+    offset = (whether there is one, precision of its prior, weight its logarithm is relative to, least of that term)
+    """
     ny, nx = mean.shape[0] - 2, mean.shape[1] - 2
     costs = np.empty(len(poses))
     for p in range(len(poses)):
         h, j, i = poses[p, 0], poses[p, 1], poses[p, 2]
-        base = heading_cost[h] + _distance_cost(j, i, 1, prior)
-        if demeaned:
-            costs[p] = _demeaned_cost(
-                ny, nx, j, i, z[h], row[h], column[h], noise, floor_variance, mean, variance, base
-            )
+        base = course_cost[h] + _distance_cost(j, i, 1, prior)
+        if offset[0] > 0.0:
+            costs[p] = _offset_cost(
+                ny, nx, j, i, z[h], row[h], column[h], turn[h], tilt, noise, floor_variance, inflation, offset, mean,
+                variance, base, stop
+            )  # fmt: skip
         else:
-            costs[p] = _raw_cost(
-                ny, nx, j, i, z[h], row[h], column[h], noise, floor_variance, mean, variance, base, stop
+            costs[p] = _plain_cost(
+                ny, nx, j, i, z[h], row[h], column[h], noise, floor_variance, inflation, mean, variance, base, stop
             )
     return costs
 
 
 @numba.njit(cache=True, nogil=True)
 def block_bounds(  # type: ignore[no-untyped-def]
-    blocks, side, demeaned, z, row, column, kind, ladder, level, records, codes, heading_cost, prior, stop
+    blocks, side, offset, z, row, column, turn, tilt, kind, ladder, level, records, codes, course_cost, prior, stop
 ):
-    """Lower bounds (p,) of the costs in blocks (p, 3) of (heading, first row, first column), given up beyond `stop`.
+    """Lower bounds (p,) of the costs in blocks (p, 3) of (course, first row, first column), given up beyond `stop`.
 
-    ladder (kinds of noise, c, steps, 2) variances and their logs; level = (base, shift, height, width) of the records.
+    ladder (kinds of noise, steps, 2) inflated variances and c times their logs; level = (base, shift, height, width) of
+    the records; offset as in `pose_costs`.
     """
-    found, scratch = np.empty(len(blocks)), np.empty((4, z.shape[2], z.shape[1]))
+    found = np.empty(len(blocks))
     for p in range(len(blocks)):
         h, j, i = blocks[p, 0], blocks[p, 1], blocks[p, 2]
-        base = heading_cost[h] + _distance_cost(j, i, side, prior)
-        if demeaned:
-            bound = _demeaned_bound(
-                j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop, scratch
+        base = course_cost[h] + _distance_cost(j, i, side, prior)
+        if offset[0] > 0.0:
+            bound = _offset_bound(
+                j, i, z[h], row[h], column[h], turn[h], tilt, kind, ladder, offset, level, records, codes, base, stop
             )
         else:
-            bound = _raw_bound(j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop)
+            bound = _plain_bound(j, i, z[h], row[h], column[h], kind, ladder, level, records, codes, base, stop)
         found[p] = bound - _SLACK * (1.0 + abs(bound))
     return found

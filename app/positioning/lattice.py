@@ -1,39 +1,50 @@
-"""A window as the search sees it: few samples, a lattice of headings, and each sample turned by each heading.
+"""A window as the search sees it: few samples, a lattice of courses, and each sample placed and turned by each course.
 
-The poses are `(heading, cell of the last sample)`. Displacements are rounded to whole cells per heading, so that a
-block of poses displaced by a sample is a block of cells.
+A course is a heading of the window's frame, a scale of its displacements and a drift of its heading; a pose is
+`(course, cell of the last sample)`. Displacements are rounded to whole cells per course, so that a block of poses
+displaced by a sample is a block of cells.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from app.errors import Fault, InvalidInput
-from app.field.expected_error import DECORRELATED_SHARE, UNKNOWN_CORRELATION_M
 from app.field.samples import Components
 from app.geometry import Array
 from app.positioning.features import window_features
-from app.positioning.window import Window
+from app.positioning.window import Window, course_yaw_rad
 
-__all__ = ["ReducedWindow", "Turned", "effective_samples", "heading_lattice", "reduce_window", "turn_window"]
+__all__ = [
+    "Courses", "ReducedWindow", "Steps", "Turned", "bent_m", "course_lattice", "heading_lattice", "reduce_window", "single_course",
+    "turn_window", "widest_steps",
+]  # fmt: skip
 
 MIN_HEADINGS, MAX_HEADINGS = 72, 720
-MOST_SAMPLES = 200  # of a reduced window: fifty metres at 0.25 m
+MAX_SCALES, MAX_DRIFTS = 13, 9
+MOST_SAMPLES = 200  # of a reduced window
 LEAST_HEADING_SD_RAD = 1e-4
 _HEADING_PRIOR_SDS = 4.5  # how far a heading prior is searched
+_NUISANCE_PRIOR_SDS = 2.6  # how far scale and drift are searched: 99 % of their prior
+_LOSS_NATS = 2.5  # what a course midway between two of the lattice may cost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedWindow:
     """The samples that are matched, in order of time.
 
-    features_uT            (n, c) mean of the samples walked over within one spacing, in the window's frame
+    features_uT            (n, c) mean of the samples walked over within one spacing, in the window's frame, scaled
     from_last_m            (n, 2) their position from the last sample, in the window's frame
     noise_variance_uT2     (n,) of the mean of those samples
     path_m                 (n,) distance walked
     components             what the features are
+    scale                  (c,) what the components were multiplied by
     turns                  whether a heading turns the features (vector components of a level window)
+    yaw_rad                (n,) of the sensor in the window's frame, from the first sample's; zero where features are not
+                           vectors
+    tilt                   (n, 3, 3) rotation from the frame's axes turned by yaw to the sensor's, or (0, 3, 3): upright
     """
 
     features_uT: Array
@@ -41,21 +52,61 @@ class ReducedWindow:
     noise_variance_uT2: Array
     path_m: Array
     components: Components
+    scale: Array
     turns: bool
+    yaw_rad: Array
+    tilt: Array
 
     def __len__(self) -> int:
         return len(self.features_uT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Courses:
+    """Hypotheses of a window's course, (h,) each.
+
+    heading_rad           yaw of the window's frame, half-way along the path
+    scale                 true over told displacements
+    drift_rad_per_m       heading gained per metre walked, beyond what was told
+    log_prior             log weight: over scales and drifts it sums to one; the heading's is a density up to a constant
+    steps                 distance between neighbouring values
+    """
+
+    heading_rad: Array
+    scale: Array
+    drift_rad_per_m: Array
+    log_prior: Array
+    steps: "Steps"
+
+    def __len__(self) -> int:
+        return len(self.heading_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """The lattice's spacing: heading (rad), scale, drift (rad/m)."""
+
+    heading_rad: float
+    scale: float
+    drift_rad_per_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """A window at every heading: features_uT (h, n, c), offset_cells (h, n, 2) (row, column) from the last sample."""
+    """A window at every course.
+
+    features_uT (h, n, c), offset_cells (h, n, 2) (row, column) from the last sample, turn (h, n, 2) cosine and sine of
+    the sensor's yaw in the building frame
+    """
 
     features_uT: Array
     offset_cells: NDArray[np.int64]
+    turn: Array
 
 
-def reduce_window(window: Window, components: Components, spacing_m: float) -> ReducedWindow:
+def reduce_window(
+    window: Window, components: Components, spacing_m: float, scale: Array | None = None
+) -> ReducedWindow:
     """Average the samples within each `spacing_m` walked: standing still adds no position information.
 
     Of more than `MOST_SAMPLES` averages, that many are kept, evenly spaced, the first and the last among them.
@@ -63,16 +114,48 @@ def reduce_window(window: Window, components: Components, spacing_m: float) -> R
     displacement = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(displacement, axis=0), axis=1))])
     bins = np.floor(path / spacing_m + 1e-9).astype(np.int64)
-    _, group, count = np.unique(bins, return_inverse=True, return_counts=True)
+    _, first, group, count = np.unique(bins, return_index=True, return_inverse=True, return_counts=True)
     kept = np.unique(np.linspace(0, len(count) - 1, min(len(count), MOST_SAMPLES)).round().astype(np.int64))
+    features = _group_means(window_features(window, components), group, count)[kept]
+    scale = np.ones(features.shape[1]) if scale is None else scale
+    vectors, middle = components == "vector", (first + count // 2)[kept]
+    yaw, tilt = np.zeros(len(kept)), np.empty((0, 3, 3))
+    if vectors and window.device_to_frame is not None:
+        tilt = np.swapaxes(np.asarray(window.device_to_frame, dtype=np.float64)[middle], 1, 2)
+    elif vectors:
+        yaw = np.asarray(course_yaw_rad(displacement) if window.yaw_rad is None else window.yaw_rad)[middle]
     return ReducedWindow(
-        features_uT=_group_means(window_features(window, components), group, count)[kept],
+        features_uT=scale * features,
         from_last_m=_group_means(displacement - displacement[-1], group, count)[kept],
-        noise_variance_uT2=window.noise_uT**2 / count[kept],
+        noise_variance_uT2=float(np.mean(np.square(scale))) * window.noise_uT**2 / count[kept],
         path_m=_group_means(path[:, None], group, count)[kept, 0],
         components=components,
-        turns=components == "vector" and window.frame == "level",
+        scale=scale,
+        turns=vectors and window.frame == "level",
+        yaw_rad=yaw,
+        tilt=np.ascontiguousarray(tilt),
     )
+
+
+def widest_steps(window: ReducedWindow, gradient_uT_per_m: float, variance_uT2: Array, offset: float | None) -> Steps:
+    """Steps at which a course midway between two of the lattice loses at most `_LOSS_NATS`, given the error's variances (n,).
+
+    What turning and stretching the window change follows from the rms gradient of the map and the levers of the samples
+    about their middle, since a pose is free to move; what an offset of precision `offset` explains does not count.
+    """
+    weight = 1.0 / variance_uT2
+    across = 0.5 * gradient_uT_per_m**2
+    centred = window.from_last_m - window.from_last_m.mean(axis=0)
+    along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
+    lever2 = np.sum(np.square(centred), axis=1)
+    _, sideways = bent_m(window, np.zeros(1))
+    heading, drift = float(across * weight @ lever2), float(across * weight @ np.sum(np.square(sideways), axis=1))
+    if window.turns:
+        turned = np.column_stack([-window.features_uT[:, 1], window.features_uT[:, 0]])
+        heading += _explained(turned, weight, offset)
+        drift += _explained(turned * along[:, None], weight, offset)
+    scale = float(across * weight @ lever2)
+    return Steps(*(float(2.0 * np.sqrt(2.0 * _LOSS_NATS / max(x, 1e-12))) for x in (heading, scale, drift)))
 
 
 def heading_lattice(window: Window, step_rad: float) -> Array:
@@ -100,30 +183,89 @@ def heading_lattice(window: Window, step_rad: float) -> Array:
     return np.asarray((centre or 0.0) + np.linspace(-reach, reach, 2 * sides + 1))
 
 
-def turn_window(window: ReducedWindow, headings_rad: Array, resolution_m: float) -> Turned:
-    """Turn features and displacements to the building frame at every heading and round to cells."""
-    c, s = np.cos(headings_rad)[:, None], np.sin(headings_rad)[:, None]
-    dx, dy = window.from_last_m.T
-    east, north = c * dx - s * dy, s * dx + c * dy
-    offsets = np.rint(np.stack([north, east], axis=-1) / resolution_m).astype(np.int64)
-    features = np.broadcast_to(window.features_uT, (len(headings_rad), *window.features_uT.shape)).copy()
+def course_lattice(window: Window, steps: Steps, scale_sd: float, drift_sd_rad_per_m: float) -> Courses:
+    """Every heading with every scale and drift that their priors leave likely, at most `steps` apart."""
+    widest = float(np.clip(steps.heading_rad, 2 * np.pi / MAX_HEADINGS, 2 * np.pi / MIN_HEADINGS))
+    heading = heading_lattice(window, widest)
+    heading_log = np.zeros(len(heading))
+    if window.frame != "building" and window.heading_rad is not None and window.heading_sd_rad:
+        off = np.angle(np.exp(1j * (heading - window.heading_rad)))
+        heading_log = -0.5 * np.square(off / window.heading_sd_rad)
+    turning_sd = 0.0 if window.frame == "building" else drift_sd_rad_per_m
+    scale, scale_log, scale_step = _nodes(scale_sd, steps.scale, MAX_SCALES)
+    drift, drift_log, drift_step = _nodes(turning_sd, steps.drift_rad_per_m, MAX_DRIFTS)
+    h, s, d = (a.ravel() for a in np.meshgrid(np.arange(len(heading)), np.arange(len(scale)), np.arange(len(drift)),
+                                              indexing="ij"))  # fmt: skip
+    heading_step = float(abs(heading[1] - heading[0])) if len(heading) > 1 else 1.0
+    return Courses(
+        heading[h], 1.0 + scale[s], drift[d], heading_log[h] + scale_log[s] + drift_log[d],
+        Steps(heading_step, scale_step, drift_step),
+    )  # fmt: skip
+
+
+def single_course(heading_rad: Array) -> Courses:
+    """Headings (h,) alone, all alike: displacements as told."""
+    h = len(heading_rad)
+    step = float(abs(heading_rad[1] - heading_rad[0])) if h > 1 else 1.0
+    return Courses(np.asarray(heading_rad), np.ones(h), np.zeros(h), np.zeros(h), Steps(step, 1.0, 1.0))
+
+
+def turn_window(window: ReducedWindow, courses: Courses, resolution_m: float) -> Turned:
+    """Place and turn the samples in the building frame for every course, and round places to cells."""
+    along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
+    yaw = courses.heading_rad[:, None] + courses.drift_rad_per_m[:, None] * along
+    c, s = np.cos(yaw), np.sin(yaw)
+    p = _placed_m(window, courses)
+    offsets = np.rint(np.stack([p[..., 1], p[..., 0]], axis=-1) / resolution_m).astype(np.int64)
+    features = np.broadcast_to(window.features_uT, (len(courses), *window.features_uT.shape)).copy()
+    turn = np.zeros((len(courses), len(window), 2))
+    turn[..., 0] = 1.0
     if window.turns:
         x, y = window.features_uT[:, 0], window.features_uT[:, 1]
         features[..., 0], features[..., 1] = c * x - s * y, s * x + c * y
-    return Turned(features, offsets)
+    if window.components == "vector":
+        sensor = window.yaw_rad + (yaw if window.turns else 0.0 * yaw)
+        turn[..., 0], turn[..., 1] = np.cos(sensor), np.sin(sensor)
+    return Turned(features, offsets, turn)
 
 
-def effective_samples(path_m: Array, correlation_m: float, share: float = DECORRELATED_SHARE) -> float:
-    """How many independent samples a window is worth, at least 1 and at most as many as it has.
+def _placed_m(window: ReducedWindow, courses: Courses) -> Array:
+    """(h, n, 2) positions from the last sample in the building frame: turned, stretched and bent."""
+    c, s = np.cos(courses.heading_rad)[:, None], np.sin(courses.heading_rad)[:, None]
+    told, _ = bent_m(window, courses.drift_rad_per_m)
+    dx, dy = courses.scale[:, None] * told[..., 0], courses.scale[:, None] * told[..., 1]
+    return np.stack([c * dx - s * dy, s * dx + c * dy], axis=-1)
 
-    One per `share` of the correlation length walked. A position follows from differences of the field along the walk,
-    whose errors decorrelate several times faster than the errors themselves: the default is what calibrates
-    (benchmarks/calibration.py). A correlation of zero means unknown, and is taken as two metres.
-    """
-    n = float(len(path_m))
-    if correlation_m <= 0.0:
-        correlation_m = UNKNOWN_CORRELATION_M
-    return min(n, 1.0 + float(path_m[-1] - path_m[0]) / (share * correlation_m))
+
+def bent_m(window: ReducedWindow, drift_rad_per_m: Array) -> tuple[Array, Array]:
+    """Positions from the last sample (h, n, 2), in the window's frame, under drifts (h,) of its heading about the middle
+    of the path (first order), and their derivative with the drift (n, 2)."""
+    along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
+    step = np.diff(window.from_last_m, axis=0)
+    turned = np.column_stack([-step[:, 1], step[:, 0]]) * (0.5 * (along[1:] + along[:-1]))[:, None]
+    gained = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
+    sideways = gained - gained[-1]
+    return window.from_last_m + drift_rad_per_m[:, None, None] * sideways, sideways
+
+
+def _explained(turned: Array, weight: Array, offset: float | None) -> float:
+    """Weighted squares of vectors (n, 2), less what a constant explains."""
+    squares = float(weight @ np.sum(np.square(turned), axis=1))
+    if offset is None:
+        return squares
+    return squares - float(np.sum(np.square(weight @ turned))) / (float(weight.sum()) + offset)
+
+
+def _nodes(sd: float, step: float, most: int) -> tuple[Array, Array, float]:
+    """Values about zero within the prior, their log weights (summing to one), and their spacing."""
+    reach = _NUISANCE_PRIOR_SDS * sd
+    if reach <= 0.5 * step:
+        return np.zeros(1), np.zeros(1), 1.0
+    sides = min(int(np.ceil(reach / step - 0.5)), most // 2)
+    value = np.linspace(-sides, sides, 2 * sides + 1) * (reach / (sides + 0.5))
+    half = reach / (2 * sides + 1)
+    weight = norm.cdf((value + half) / sd) - norm.cdf((value - half) / sd)
+    return value, np.log(weight / weight.sum()), 2.0 * half
 
 
 def _group_means(values: Array, group: NDArray[np.int64], count: NDArray[np.int64]) -> Array:

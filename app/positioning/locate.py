@@ -56,8 +56,8 @@ def locate(
     shared = common_components(window.frame, {floor.floor_id: floor.components for floor in floors})
     noise_sd_uT = shared_noise_sd_uT([floor.grid for floor in floors])
     ready = [reduce_floor(floor, shared, noise_sd_uT) for floor in floors]
-    matched = match(window, ready, shared, composition == "demeaned", prior, options)
-    return conclude(matched, believe(matched, options), techniques, options)
+    matched = match(window, ready, shared, composition, prior, options)
+    return conclude(matched, believe(matched), techniques, options)
 
 
 def warm_up() -> None:
@@ -98,10 +98,10 @@ def _check_window(window: Window, composition: Composition) -> None:
         faults.append(Fault("/window/heading_sd_rad", "must not be negative"))
     if window.yaw_rad is not None and (np.shape(window.yaw_rad) != (n,) or not np.all(np.isfinite(window.yaw_rad))):
         faults.append(Fault("/window/yaw_rad", f"needs {n} finite numbers, one per sample"))
-    if composition == "demeaned" and n == 1:
+    if composition in ("demeaned", "differenced") and n == 1:
         faults.append(Fault("/composition", "one sample without its mean tells nothing; send more samples or use raw"))
-    if composition not in ("raw", "demeaned"):
-        faults.append(Fault("/composition", f"{composition} is not offered; use raw or demeaned"))
+    if composition not in ("raw", "demeaned", "differenced", "feature"):
+        faults.append(Fault("/composition", f"{composition} is not offered; use raw, demeaned, differenced or feature"))
     if faults:
         raise InvalidWindow(f"the window cannot be matched: {faults[0].location} {faults[0].reason}", *faults)
 

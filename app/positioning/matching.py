@@ -1,33 +1,27 @@
-"""Match a window with the candidate floors: reduce it, choose the headings, search, keep what a belief is made of."""
+"""Match a window with the candidate floors: reduce it, choose the courses, search, score what was found in full."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from app.field.error_structure import strictest
 from app.field.samples import Components
 from app.geometry import Array
 from app.positioning.fix import LocateOptions, Prior
 from app.positioning.floors import Plane, SearchableFloor
-from app.positioning.lattice import (
-    MAX_HEADINGS,
-    MIN_HEADINGS,
-    ReducedWindow,
-    effective_samples,
-    heading_lattice,
-    reduce_window,
-)
-from app.positioning.refine import PoseGaussian
+from app.positioning.lattice import Courses, ReducedWindow, Turned, course_lattice, reduce_window, turn_window, widest_steps
+from app.positioning.scoring import score_poses
 from app.positioning.search import Candidates, PosePrior, search
-from app.positioning.window import Window
+from app.positioning.window import Composition, Window, course_yaw_rad
+from app.positioning.window_error import WindowError, differenced, window_error
 
 __all__ = ["Matched", "device_turn_rad", "match"]
 
-_KEPT_NATS = 10.0  # tempered: poses this much less likely than the best are left out of the belief
-_HEADING_LOSS_NATS = 1.0  # tempered: what a heading midway between two of the lattice may cost
-_GATE_SHARE = 2.0  # squares of residuals add one independent term per two correlation lengths
-_COURSE_M = 1.0  # the stretch over which a course is taken
+_KEPT_NATS = 10.0  # poses this much less likely than the best, as they are searched, are left out of the belief
+_SAMPLES = 40  # of a window of some length: more are averaged, as long as they stay near each other
+_SPACING_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,12 +29,13 @@ class Matched:
     """A window matched with floors.
 
     floors, planes     planes[k] belongs to floors[plane_floor[k]]
-    window             as it was matched; `temper` = its samples / what they are worth as independent ones for a
-                       position, `gate_temper` the same for the squares of their residuals
-    headings_rad       (h,) yaws of the window's frame; `device_turn_rad` is added for the device's heading at the last
-                       sample (None: a building window has no heading to tell)
+    window, error      as it was matched; `turned[k]` the window on planes[k]
+    courses            of the lattice; `device_turn_rad` is added for the device's heading at the last sample (None: a
+                       building window has no heading to tell)
     candidates         poses of the lattice; position_m (n, 2) of the last sample
-    pose_prior         for the lattice; `gaussian` the same prior for refinement
+    score              (n,) log density of the window's features under the full covariance, plus log prior, best first
+    distance2          (n,) its squared distance
+    pose_prior         of the position
     prior_mass         of the lattice under the priors, each pose weighing exp(log prior)
     """
 
@@ -48,15 +43,17 @@ class Matched:
     planes: tuple[Plane, ...]
     plane_floor: NDArray[np.int64]
     window: ReducedWindow
-    temper: float
-    gate_temper: float
-    demeaned: bool
-    headings_rad: Array
+    turned: tuple[Turned, ...]
+    error: WindowError
+    courses: Courses
+    asked: Window
+    options: LocateOptions
     device_turn_rad: float | None
     candidates: Candidates
     position_m: Array
+    score: Array
+    distance2: Array
     pose_prior: PosePrior
-    gaussian: PoseGaussian
     prior_mass: float
 
 
@@ -64,88 +61,105 @@ def match(
     window: Window,
     floors: Sequence[SearchableFloor],
     components: Components,
-    demeaned: bool,
+    composition: Composition,
     prior: Prior | None,
     options: LocateOptions,
 ) -> Matched:
     """Search all floors, which must already hold `components`, for every pose that matters."""
     planes = tuple(plane for floor in floors for plane in floor.planes)
-    reduced = reduce_window(window, components, min(plane.resolution_m for plane in planes))
-    correlation = max(floor.grid.error_correlation_m for floor in floors)
-    temper = len(reduced) / effective_samples(reduced.path_m, correlation)
-    headings = heading_lattice(window, _heading_step(reduced, planes, temper, demeaned))
+    typical = float(np.mean([plane.typical_variance_uT2 for plane in planes]))
+    structure = strictest([floor.grid.error_structure for floor in floors])
+    reduced = _reduced(window, components, planes, structure.white_share * typical)
+    known = composition in ("raw", "feature")
+    bias_sd_uT = options.bias_sd_uT if known else None
+    error = window_error(reduced.path_m, reduced.noise_variance_uT2, typical, structure, bias_sd_uT)
+    least = min(float(plane.pyramid.ladder_uT2[0]) for plane in planes)
+    variance = error.inflation * (error.own_share * least + reduced.noise_variance_uT2)
+    steepest = max(plane.gradient_uT_per_m for plane in planes)
+    steps = widest_steps(reduced, steepest, variance, error.offset_precision)
+    courses = course_lattice(window, steps, options.step_scale_sd, options.heading_drift_sd_rad_per_m)
     pose_prior = PosePrior(
-        prior.position_m if prior else None, prior.sd_m if prior else 1.0, _heading_log(window, headings)
+        prior.position_m if prior else None, prior.sd_m if prior else 1.0, _walkable(floors, options)
     )
     kept = max(_KEPT_NATS, float(np.log(options.mlr_ratio)) + 1.0)
     found = search(
-        planes, reduced, headings, pose_prior, window_nats=temper * kept, temper=temper, demeaned=demeaned
+        planes, reduced, courses, pose_prior, error, window_nats=kept, out_of_time=options.out_of_time
     )  # fmt: skip
+    turned = tuple(turn_window(reduced, courses, plane.resolution_m) for plane in planes)
+    if composition == "differenced":
+        error = replace(error, whiten=differenced(len(reduced)) @ np.eye(len(reduced)), log_det=0.0, offset_precision=None)
+    score, distance2 = _scored(planes, reduced, turned, found, error)
+    position = _positions(planes, found)
+    score = score + _log_prior(planes, found, courses, position, pose_prior)
+    order = np.argsort(-score, kind="stable")
+    found = replace(found, plane=found.plane[order], course=found.course[order], row=found.row[order],
+                    column=found.column[order], score=found.score[order])  # fmt: skip
     return Matched(
         floors=tuple(floors),
         planes=planes,
         plane_floor=np.array([k for k, floor in enumerate(floors) for _ in floor.planes]),
         window=reduced,
-        temper=temper,
-        gate_temper=len(reduced) / effective_samples(reduced.path_m, correlation, _GATE_SHARE),
-        demeaned=demeaned,
-        headings_rad=headings,
+        turned=turned,
+        error=error,
+        courses=courses,
+        asked=window,
+        options=options,
         device_turn_rad=None if window.frame == "building" else device_turn_rad(window),
         candidates=found,
-        position_m=_positions(planes, found),
+        position_m=position[order],
+        score=score[order],
+        distance2=distance2[order],
         pose_prior=pose_prior,
-        gaussian=_gaussian(window, prior, headings),
-        prior_mass=_prior_mass(planes, pose_prior),
+        prior_mass=_prior_mass(planes, pose_prior, courses),
     )
 
 
 def device_turn_rad(window: Window) -> float:
-    """Yaw of the device at the last sample from the frame of the first: told, or how much the course turned.
-
-    The course is that of the first and of the last metre; a device that hardly moves is taken not to turn.
-    """
+    """Yaw of the device at the last sample from the frame of the first: told, or how much the course turned."""
     if window.yaw_rad is not None:
         return float(window.yaw_rad[-1])
+    return float(np.angle(np.exp(1j * course_yaw_rad(window.displacement_m)[-1])))
+
+
+def _reduced(
+    window: Window, components: Components, planes: Sequence[Plane], white_uT2: float
+) -> ReducedWindow:
+    """Samples no nearer than a cell, and no more of them than tell anything new.
+
+    White noise of a surveyor's sensor is part of what readings differ from the map by: the window's own counts where it
+    is larger.
+    """
+    cell_m = min(plane.resolution_m for plane in planes)
     d = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
-    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(d, axis=0), axis=1))])
-    if path[-1] < 0.5 * _COURSE_M:
-        return 0.0
-    start = d[min(int(np.searchsorted(path, _COURSE_M)), len(d) - 1)] - d[0]
-    end = d[-1] - d[max(int(np.searchsorted(path, path[-1] - _COURSE_M, side="right")) - 1, 0)]
-    if min(np.linalg.norm(start), np.linalg.norm(end)) < 0.1 * _COURSE_M:
-        return 0.0
-    return float(np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end))
+    length_m = float(np.linalg.norm(np.diff(d, axis=0), axis=1).sum())
+    spacing_m = max(cell_m, min(length_m / _SAMPLES, _SPACING_M))
+    reduced = reduce_window(window, components, spacing_m, planes[0].scale)
+    return replace(reduced, noise_variance_uT2=np.maximum(reduced.noise_variance_uT2 - white_uT2, 0.0))
 
 
-def _heading_step(window: ReducedWindow, planes: Sequence[Plane], temper: float, demeaned: bool) -> float:
-    """A step at which the pose between two headings of the lattice loses at most `_HEADING_LOSS_NATS`, tempered."""
-    centred = window.from_last_m - window.from_last_m.mean(axis=0)
-    lever = np.sum(np.square(centred), axis=1)
-    steepest = max(plane.gradient_uT_per_m for plane in planes)
-    change = 0.5 * steepest**2 * lever  # squared, per radian
-    if window.turns:
-        turning = window.features_uT[:, :2] - (window.features_uT[:, :2].mean(axis=0) if demeaned else 0.0)
-        change = change + np.sum(np.square(turning), axis=1)
-    least = min(float(plane.pyramid.ladder_uT2[:, 0].min()) for plane in planes)
-    information = float(np.sum(change / (least + window.noise_variance_uT2))) / temper
-    widest = 2.0 * np.sqrt(2.0 * _HEADING_LOSS_NATS / max(information, 1e-12))
-    return float(np.clip(widest, 2 * np.pi / MAX_HEADINGS, 2 * np.pi / MIN_HEADINGS))
+def _scored(
+    planes: Sequence[Plane], window: ReducedWindow, turned: Sequence[Turned], found: Candidates, error: WindowError
+) -> tuple[Array, Array]:
+    """Log density and squared distance (n,) of every candidate."""
+    log_l, distance2 = np.zeros(len(found.score)), np.zeros(len(found.score))
+    for k, plane in enumerate(planes):
+        here = found.plane == k
+        if here.any():
+            poses = found.course[here], found.row[here], found.column[here]
+            fit = score_poses(plane, window, turned[k], poses, error)
+            log_l[here], distance2[here] = fit.log_l, fit.distance2
+    return log_l, distance2
 
 
-def _heading_log(window: Window, headings_rad: Array) -> Array:
-    if window.frame == "building" or window.heading_rad is None or not window.heading_sd_rad:
-        return np.zeros(len(headings_rad))
-    off = np.angle(np.exp(1j * (headings_rad - window.heading_rad)))
-    return np.asarray(-0.5 * np.square(off / window.heading_sd_rad))
-
-
-def _gaussian(window: Window, prior: Prior | None, headings_rad: Array) -> PoseGaussian:
-    mean, precision = np.zeros(3), np.zeros(3)
-    if prior is not None:
-        mean[:2], precision[:2] = prior.position_m[:2], prior.sd_m**-2
-    if window.frame != "building" and window.heading_rad is not None and window.heading_sd_rad:
-        mean[2], precision[2] = window.heading_rad, window.heading_sd_rad**-2
-    return PoseGaussian(mean, precision, np.array([1.0, 1.0, 1.0 if len(headings_rad) > 1 else 0.0]))
+def _log_prior(
+    planes: Sequence[Plane], found: Candidates, courses: Courses, position_m: Array, prior: PosePrior
+) -> Array:
+    log_prior = courses.log_prior[found.course]
+    if prior.position_m is None:
+        return np.asarray(log_prior)
+    height_m = np.array([plane.height_m for plane in planes])[found.plane]
+    off = np.column_stack([position_m, height_m]) - np.array(prior.position_m)
+    return np.asarray(log_prior - 0.5 * np.sum(np.square(off), axis=1) / prior.sd_m**2)
 
 
 def _positions(planes: Sequence[Plane], found: Candidates) -> Array:
@@ -154,17 +168,32 @@ def _positions(planes: Sequence[Plane], found: Candidates) -> Array:
     return np.asarray(origin + cell[:, None] * np.stack([found.column, found.row], axis=1))
 
 
-def _prior_mass(planes: Sequence[Plane], prior: PosePrior) -> float:
-    headings = float(np.exp(prior.heading_log).sum())
+def _walkable(floors: Sequence[SearchableFloor], options: LocateOptions) -> list[NDArray[np.bool_]] | None:
+    """Per plane, the cells whose centres the options' area holds."""
+    if options.walkable is None:
+        return None
+    masks = []
+    for floor in floors:
+        for plane in floor.planes:
+            ny, nx = plane.shape
+            x = plane.origin_m[0] + plane.resolution_m * np.arange(nx)
+            y = plane.origin_m[1] + plane.resolution_m * np.arange(ny)
+            masks.append(np.asarray(options.walkable(floor.floor_id, x, y), dtype=np.bool_))
+    return masks
+
+
+def _prior_mass(planes: Sequence[Plane], prior: PosePrior, courses: Courses) -> float:
     total = 0.0
-    for plane in planes:
+    for k, plane in enumerate(planes):
         ny, nx = plane.shape
+        mask = None if prior.walkable is None else prior.walkable[k]
         if prior.position_m is None:
-            total += float(ny * nx)
+            total += float(ny * nx if mask is None else mask.sum())
             continue
         x = plane.origin_m[0] + plane.resolution_m * np.arange(nx) - prior.position_m[0]
         y = plane.origin_m[1] + plane.resolution_m * np.arange(ny) - prior.position_m[1]
         height = np.exp(-0.5 * ((plane.height_m - prior.position_m[2]) / prior.sd_m) ** 2)
-        across = np.exp(-0.5 * (x / prior.sd_m) ** 2).sum() * np.exp(-0.5 * (y / prior.sd_m) ** 2).sum()
-        total += float(height * across)
-    return max(headings * total, 1e-300)
+        along_y, along_x = np.exp(-0.5 * (y / prior.sd_m) ** 2), np.exp(-0.5 * (x / prior.sd_m) ** 2)
+        held = along_y.sum() * along_x.sum() if mask is None else along_y @ mask @ along_x
+        total += float(height * held)
+    return max(float(np.exp(courses.log_prior).sum()) * total, 1e-300)

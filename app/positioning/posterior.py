@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from app.geometry import Array
 
 __all__ = [
-    "DISPLACEMENT_SCALE_SD", "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius",
+    "DISPLACEMENT_SD", "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius",
     "mixture_points", "replace_narrow_mode", "untold_variance_m2",
 ]  # fmt: skip
 
 POSITION_SD_FLOOR_M = 0.03  # of the map's coordinates
-DISPLACEMENT_SCALE_SD = 0.02  # of a window's displacements
+DISPLACEMENT_SD = 0.01  # of the distance from a window's middle to its end, beyond scale and drift
 _RINGS, _SPOKES = 24, 12
 _MANY = 4000
 
@@ -40,7 +40,7 @@ class Atoms:
 def untold_variance_m2(from_last_m: Array) -> float:
     """Variance per axis of the last position that matching leaves, from the samples' positions (n, 2) from the last."""
     lever = float(np.linalg.norm(from_last_m.mean(axis=0)))
-    return POSITION_SD_FLOOR_M**2 + (DISPLACEMENT_SCALE_SD * lever) ** 2
+    return POSITION_SD_FLOOR_M**2 + (DISPLACEMENT_SD * lever) ** 2
 
 
 def find_modes(

@@ -40,8 +40,9 @@ def conclude(matched: Matched, belief: Belief, techniques: Sequence[str], option
 
 def _ml(matched: Matched, belief: Belief) -> MlEstimate:
     best = belief.best
+    unscaled = best.log_l + len(matched.window) * float(np.log(matched.window.scale).sum())
     return MlEstimate(
-        _floor_id(matched, best.plane), _position(matched, best.plane, best.pose), _heading(matched, best), best.log_l
+        _floor_id(matched, best.plane), _position(matched, best.plane, best.pose), _heading(matched, best), unscaled
     )
 
 
@@ -52,9 +53,8 @@ def _mlr(matched: Matched, belief: Belief, options: LocateOptions) -> MlrEstimat
         return MlrEstimate(
             False, None, reason=f"the map ends within {far:g} m of the best match: no rival to compare with"
         )
-    score = found.score / matched.temper
-    rival = likelihood_rival(matched.position_m, found.plane, score, 0, far)
-    log_ratio = rival.log_ratio if rival else found.window_nats / matched.temper
+    rival = likelihood_rival(matched.position_m, found.plane, matched.score, 0, far)
+    log_ratio = rival.log_ratio if rival else found.window_nats
     ratio = float(np.exp(min(log_ratio, 700.0)))
     if not ratio > options.mlr_ratio:
         reason = f"a place {far:g} m away or more matches nearly as well: ratio {ratio:.2f}, not {options.mlr_ratio:g}"
@@ -127,9 +127,10 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
 
 
 def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[Status, str | None]:
-    scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if matched.demeaned else 0)
-    distance2 = belief.best.distance2 / matched.gate_temper
-    limit = chi_square_limit(scalars / matched.gate_temper, options.gate_probability)
+    flat = matched.error.offset_precision == 0.0
+    scalars = matched.window.features_uT.size - (matched.window.features_uT.shape[1] if flat else 0)
+    distance2 = belief.best.distance2
+    limit = chi_square_limit(scalars, options.gate_probability)
     unlike_any_field = belief.off_map_distance2 > chi_square_limit(belief.off_map_scalars, options.gate_probability)
     if belief.unmapped > 0.5 and not (unlike_any_field and distance2 > limit):
         weighed = "not all of the map was weighed, but " if _unweighed(matched, belief) > 0.5 else ""
@@ -138,16 +139,16 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
             "on into mapped corridors, or survey where this was recorded; if it was recorded on mapped ground, "
             "calibrate the magnetometer or use composition demeaned"
         )
-    if _unweighed(matched, belief) > 0.5:
-        return "ambiguous", (
-            "the window matches so many places that not all of them were weighed; walk further, or send a prior "
-            "position or heading"
-        )
     if distance2 > limit:
         return "inconsistent", (
             f"even the best match is worse than chance allows (chi-square {distance2:.1f}, limit {limit:.1f}); check "
             "units, frame and calibration, or whether the building changed since the survey; composition demeaned "
             "removes an offset"
+        )
+    if _unweighed(matched, belief) > 0.5:
+        return "ambiguous", (
+            "the window matches so many places that not all of them were weighed; walk further, or send a prior "
+            "position or heading"
         )
     strongest = belief.modes[0].probability * (1.0 - belief.unmapped) * (1.0 - _unweighed(matched, belief))
     if strongest < _CERTAIN:
@@ -214,4 +215,5 @@ def _position(matched: Matched, plane: int, pose: Array) -> Position:
 def _heading(matched: Matched, mode: BelievedMode) -> float | None:
     if matched.device_turn_rad is None:
         return None
-    return float(wrap_angle_rad(mode.pose[2] + matched.device_turn_rad))
+    half_m = 0.5 * float(matched.window.path_m[-1] - matched.window.path_m[0])
+    return float(wrap_angle_rad(mode.pose[2] + mode.pose[4] * half_m + matched.device_turn_rad))

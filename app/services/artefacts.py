@@ -5,6 +5,7 @@ The same values always give the same bytes, so a map's content hash is also the 
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from app.errors import CorruptArtefact
+from app.field.error_structure import UNKNOWN_STRUCTURE, ErrorStructure
 from app.field.grid import FieldGrid
 from app.field.samples import Samples
 
@@ -30,7 +32,8 @@ def grid_to_bytes(grid: FieldGrid) -> bytes:
     """A grid as one immutable blob."""
     return pack(
         {"kind": "grid", "components": grid.components, "resolution_m": grid.resolution_m,
-         "origin_m": list(grid.origin_m), "error_correlation_m": grid.error_correlation_m},
+         "origin_m": list(grid.origin_m), "error_correlation_m": grid.error_correlation_m,
+         "error_structure": asdict(grid.error_structure)},
         {"heights_m": grid.heights_m, "mean_uT": grid.mean_uT, "sd_uT": grid.sd_uT,
          "gradient_uT_per_m": grid.gradient_uT_per_m, "measured": grid.measured, "ambient_uT": grid.ambient_uT,
          "prior_sd_uT": grid.prior_sd_uT, "noise_sd_uT": grid.noise_sd_uT},
@@ -45,6 +48,7 @@ def grid_from_bytes(data: bytes) -> FieldGrid:
         origin_m=(header["origin_m"][0], header["origin_m"][1]),
         resolution_m=header["resolution_m"],
         error_correlation_m=header["error_correlation_m"],
+        error_structure=ErrorStructure(**told) if (told := header.get("error_structure")) else UNKNOWN_STRUCTURE,
         **arrays,
     )
 

@@ -238,6 +238,7 @@ def _quality_bytes(fitted: FittedMap, changes: Result) -> bytes:
         "measured_area_m2": float(fitted.grid.measured.any(axis=0).sum()) * fitted.grid.resolution_m**2,
         "noise_sd_ut": [float(sd) for sd in fitted.grid.noise_sd_uT],
         "error_correlation_m": fitted.grid.error_correlation_m,
+        "error_structure": asdict(fitted.grid.error_structure),
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
         "changes": changes,
         "hard_iron": fitted.hard_iron,

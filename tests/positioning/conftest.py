@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from app.field.error_structure import ErrorStructure
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components
 from app.positioning.window import Window
@@ -18,6 +19,7 @@ AMBIENT = {
     "norm": np.array([46.7]),
 }
 Array = NDArray[np.float64]
+WHITE = ErrorStructure(0.0, 0.0, 1.0)
 
 
 def make_grid(
@@ -62,6 +64,7 @@ def make_grid(
         prior_sd_uT=prior_sd,
         noise_sd_uT=np.full(c, noise_sd_uT),
         error_correlation_m=error_correlation_m,
+        error_structure=WHITE,
     )
 
 
@@ -100,14 +103,16 @@ def make_walk(
             break
     points = np.column_stack([p, np.full(samples, grid.heights_m[layer])])
     truth = grid.at(points).mean_uT
-    B = truth + rng.normal(0.0, 1.0, truth.shape) * np.hypot(noise_uT, grid.noise_sd_uT)
+    B = truth + rng.normal(0.0, 1.0, truth.shape) * np.maximum(noise_uT, grid.noise_sd_uT)
     d = np.column_stack([p - p[0], np.zeros(samples)])
     if frame != "building":
         c, s = np.cos(yaw), np.sin(yaw)
         back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         d = d @ back.T
         B = B @ back.T if B.shape[1] == 3 else B
-    B = B + offset_uT
+    if B.shape[1] == 3 and offset_uT:  # constant in the device's axes, which turn with the course
+        turned = course - (yaw if frame != "building" else 0.0)
+        B = B + offset_uT * np.column_stack([np.cos(turned) - np.sin(turned), np.sin(turned) + np.cos(turned), turned**0])
     if frame == "norm" and B.shape[1] > 1:
         B = np.linalg.norm(B, axis=1, keepdims=True)
     window = Window(frame, B, d, noise_uT, yaw_rad=course - yaw)  # type: ignore[arg-type]

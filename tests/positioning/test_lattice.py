@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.positioning.lattice import effective_samples, heading_lattice, reduce_window, turn_window
+from app.positioning.lattice import course_lattice, heading_lattice, reduce_window, single_course, turn_window, widest_steps
 from app.positioning.matching import device_turn_rad
 from app.positioning.window import Window
 
@@ -52,20 +52,10 @@ def test_a_heading_without_sd_is_believed_and_a_building_window_has_one() -> Non
 
 def test_turning_by_a_quarter() -> None:
     reduced = reduce_window(window_along(np.array([[0.0, 0.0], [2.0, 0.0]])), "vector", 0.25)
-    turned = turn_window(reduced, np.array([0.0, np.pi / 2]), 0.5)
+    turned = turn_window(reduced, single_course(np.array([0.0, np.pi / 2])), 0.5)
     np.testing.assert_array_equal(turned.offset_cells[0], [[0, -4], [0, 0]])  # (row, column) = (y, x)
     np.testing.assert_array_equal(turned.offset_cells[1], [[-4, 0], [0, 0]])
     np.testing.assert_allclose(turned.features_uT[1, 1], [0.0, 2.0, 1.0], atol=1e-12)
-
-
-def test_effective_samples() -> None:
-    path = np.linspace(0.0, 10.0, 41)
-    assert effective_samples(path, 0.0) == 41
-    assert effective_samples(path, 1e9) == pytest.approx(1.0)
-    assert effective_samples(path, 1e-9) == 41
-    assert effective_samples(path[:1], 3.0) == 1.0
-    counts = [effective_samples(path, c) for c in (0.5, 2.0, 8.0)]
-    assert counts == sorted(counts, reverse=True)
 
 
 def test_device_turns_with_its_path_unless_told() -> None:

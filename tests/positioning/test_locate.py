@@ -33,7 +33,7 @@ def error_m(fix: Fix, position: np.ndarray) -> float:
 def test_position_and_heading_are_those_of_the_last_sample(
     frame: str, world: FieldGrid, walk_on: Callable, rng: np.random.Generator
 ) -> None:
-    walked = walk_on(rng, world, frame, length_m=10.0, samples=30)
+    walked = walk_on(rng, world, frame, length_m=16.0 if frame == "norm" else 10.0, samples=30)
     fix = locate(walked.window, [prepare_floor("a", world)])
     assert fix.status == "fix", fix.reason
     assert fix.ml is not None
@@ -100,7 +100,7 @@ def test_answer_turns_with_the_building(world: FieldGrid, walk_on: Callable, rng
     assert before is not None
     assert after is not None
     x, y, _ = before.position_m
-    np.testing.assert_allclose(after.position_m[:2], [-y, x], atol=0.02)
+    np.testing.assert_allclose(after.position_m[:2], [-y, x], atol=0.04)
     assert before.heading_rad is not None
     assert after.heading_rad is not None
     assert abs(wrap_angle_rad(after.heading_rad - before.heading_rad - np.pi / 2)) < 0.01
@@ -311,8 +311,8 @@ def test_other_refusals(world: FieldGrid, walk_on: Callable, rng: np.random.Gene
     window, floors = walk_on(rng, world).window, [prepare_floor("a", world)]
     with pytest.raises(InvalidWindow, match="composition"):
         locate(walk_on(rng, world, length_m=0.0, samples=1).window, floors, composition="demeaned")
-    with pytest.raises(InvalidWindow, match="feature"):
-        locate(window, floors, composition="feature")  # type: ignore[arg-type]
+    with pytest.raises(InvalidWindow, match="median"):
+        locate(window, floors, composition="median")  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="prior"):
         locate(window, floors, prior=Prior((0.0, 0.0, 0.0), 0.0))
     with pytest.raises(InvalidInput, match="abl_bin_m"):

@@ -12,7 +12,7 @@ from app.errors import InvalidInput
 from app.field.grid import FieldGrid
 from app.field.kernels import covariance
 from app.positioning.fix import Fix, Prior
-from app.positioning.lattice import MOST_SAMPLES, effective_samples, reduce_window
+from app.positioning.lattice import MOST_SAMPLES, reduce_window
 from app.positioning.locate import locate, prepare_floor
 from app.positioning.off_map import ProcessPrior, process_evidence, process_prior
 from app.positioning.window import Window
@@ -36,14 +36,14 @@ def test_evidence_is_the_density_of_the_process(demeaned: bool) -> None:
     rng = np.random.default_rng(0)
     n, prior = 7, ProcessPrior(np.array([20.0, 35.0]), 3.0)
     position, residual = rng.uniform(0, 8, (n, 2)), rng.normal(0.0, 4.0, (3, n, 2))
-    noise = rng.uniform(0.2, 1.0, (n, 2))
-    found = process_evidence(residual, position, noise, prior, demeaned)
+    errors = np.diag(rng.uniform(0.2, 1.0, n)) + 0.1
+    found = process_evidence(residual, position, errors, prior, 0.0 if demeaned else None)
     vague = 1e6 if demeaned else 0.0  # an offset of sd 1000 uT stands for the flat prior
     for h in range(3):
         expected = 0.0
         for c in range(2):
             K = prior.variance_uT2[c] * covariance("matern32", cdist(position, position), 3.0)
-            density = multivariate_normal(np.zeros(n), K + np.diag(noise[:, c]) + vague)
+            density = multivariate_normal(np.zeros(n), K + errors + vague)
             expected += density.logpdf(residual[h, :, c]) + (0.5 * np.log(2 * np.pi * vague) if demeaned else 0.0)
         assert found.log_l[h] == pytest.approx(expected, abs=2e-3)
 
@@ -51,7 +51,7 @@ def test_evidence_is_the_density_of_the_process(demeaned: bool) -> None:
 def test_samples_close_together_are_charged_once() -> None:
     """Twenty readings of one place by a noiseless sensor say what one of them says."""
     prior = ProcessPrior(np.array([25.0]), 3.0)
-    many = process_evidence(np.full((1, 20, 1), 4.0), np.zeros((20, 2)), np.full((20, 1), 1e-3), prior, False)
+    many = process_evidence(np.full((1, 20, 1), 4.0), np.zeros((20, 2)), 1e-3 * np.eye(20), prior, None)
     assert many.distance2[0] == pytest.approx(16.0 / 25.0, rel=1e-3)
 
 
@@ -99,12 +99,6 @@ def test_the_refined_position_stays_on_the_grid(grid_of: Callable, walk_on: Call
         assert fix.ml is not None
         assert x0 <= fix.ml.position_m[0] <= x1
         assert y0 <= fix.ml.position_m[1] <= y1
-
-
-def test_an_unknown_correlation_is_not_taken_for_independence() -> None:
-    path = np.linspace(0.0, 10.0, 101)
-    assert effective_samples(path, 0.0, 2.0) == effective_samples(path, 2.0, 2.0) == pytest.approx(3.5)
-    assert effective_samples(path, 0.0) < len(path)
 
 
 def test_long_windows_are_thinned(grid_of: Callable) -> None:
