@@ -4,42 +4,42 @@ A window is a short walk, so its errors have the structure that surveys showed; 
 samples follows from it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 __all__ = ["UNKNOWN_STRUCTURE", "ErrorStructure", "strictest"]
 
-MOST_SHARED = 0.98
-"""Some of every error is white: without it two readings side by side would be worth infinitely much."""
-
 
 @dataclass(frozen=True, slots=True)
 class ErrorStructure:
-    """Shares of the variance of one error: the correlation at a distance d walked is
-    `constant_share + walk_share exp(-d / walk_length_m)`, and one at d = 0.
+    """Shares of the variance a map states for one further measurement (its own and its noise's together).
+
+    The covariance of two errors a distance d walked apart is `constant_share + walk_share exp(-d / walk_length_m)` times
+    that variance, and `white_share` more at d = 0. They need not sum to one: a map states what covers errors, tails and
+    all, and means over a quarter of a metre err less than single readings.
     """
 
     constant_share: float
     walk_share: float
+    white_share: float
     walk_length_m: float
 
     def __post_init__(self) -> None:
         assert self.constant_share >= 0.0, self
         assert self.walk_share >= 0.0, self
-        assert self.constant_share + self.walk_share <= 1.0, self
+        assert self.white_share > 0.0, self
         assert self.walk_length_m > 0.0, self
 
-    @property
-    def white_share(self) -> float:
-        return 1.0 - self.constant_share - self.walk_share
 
-
-UNKNOWN_STRUCTURE = ErrorStructure(0.2, 0.5, 2.0)
+UNKNOWN_STRUCTURE = ErrorStructure(0.2, 0.5, 0.3, 2.0)
 """What errors are taken to be where no survey can be judged by another."""
 
 
-def strictest(structures: list[ErrorStructure]) -> ErrorStructure:
+def strictest(structures: Sequence[ErrorStructure]) -> ErrorStructure:
     """One structure for floors that are compared with each other: the largest share of every kind, the longest length."""
-    constant = max(each.constant_share for each in structures)
-    walk = max(each.walk_share for each in structures)
-    excess = max((constant + walk) / MOST_SHARED, 1.0)
-    return ErrorStructure(constant / excess, walk / excess, max(each.walk_length_m for each in structures))
+    return ErrorStructure(
+        max(each.constant_share for each in structures),
+        max(each.walk_share for each in structures),
+        max(each.white_share for each in structures),
+        max(each.walk_length_m for each in structures),
+    )

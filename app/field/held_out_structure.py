@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from app.field.error_structure import MOST_SHARED, UNKNOWN_STRUCTURE, ErrorStructure
+from app.field.error_structure import UNKNOWN_STRUCTURE, ErrorStructure
 from app.field.leave_one_out import LAG_M, MAX_LAG_M, HeldOut
 from app.field.tally import means_of_places
 from app.geometry import Array
@@ -16,10 +16,11 @@ __all__ = ["held_out_structure"]
 
 _LENGTHS_M = np.geomspace(0.25, 8.0, 21)
 _LEAST_PAIRS = 50
+_LEAST_WHITE = 0.02  # without it two readings side by side would be worth infinitely much
 
 
 def held_out_structure(held_out: Mapping[str, HeldOut]) -> ErrorStructure:
-    """Least squares fit of the model to the pooled autocorrelation of errors in predictive sds, up to twenty metres.
+    """Least squares fit of the model to the pooled autocovariance of errors in predictive sds, up to twenty metres.
 
     UNKNOWN_STRUCTURE when too few stretches are judged.
     """
@@ -39,19 +40,19 @@ def held_out_structure(held_out: Mapping[str, HeldOut]) -> ErrorStructure:
     if not known[0] or products[0] <= 0.0 or np.count_nonzero(known) < 8:
         return UNKNOWN_STRUCTURE
     lag_m = LAG_M * np.flatnonzero(known)[1:]
-    correlation = (products[known] / pairs[known])[1:] / (products[0] / pairs[0])
+    covariance = products[known] / pairs[known]
     weight = np.sqrt(pairs[known][1:] / pairs[0])
-    fits = [_fit(lag_m, correlation, weight, length_m) for length_m in _LENGTHS_M]
+    fits = [_fit(lag_m, covariance[1:], weight, length_m) for length_m in _LENGTHS_M]
     best = int(np.argmin([misfit for misfit, _ in fits]))
-    constant, walk = fits[best][1]
-    excess = max((constant + walk) / MOST_SHARED, 1.0)
-    return ErrorStructure(float(constant / excess), float(walk / excess), float(_LENGTHS_M[best]))
+    constant, walk = (float(share) for share in fits[best][1])
+    white = max(float(covariance[0]) - constant - walk, _LEAST_WHITE * float(covariance[0]))
+    return ErrorStructure(constant, walk, white, float(_LENGTHS_M[best]))
 
 
-def _fit(lag_m: Array, correlation: Array, weight: Array, length_m: float) -> tuple[float, Array]:
+def _fit(lag_m: Array, covariance: Array, weight: Array, length_m: float) -> tuple[float, Array]:
     """(misfit, (constant, walk)) of the best shares, neither negative, at one length."""
     design = np.column_stack([np.ones(len(lag_m)), np.exp(-lag_m / length_m)])
-    shares, misfit = nnls(weight[:, None] * design, weight * correlation)
+    shares, misfit = nnls(weight[:, None] * design, weight * covariance)
     return float(misfit), shares
 
 

@@ -54,7 +54,7 @@ def believe(matched: Matched) -> Belief:
     found, options = matched.candidates, matched.options
     relative = np.exp(matched.score - matched.score[0])
     cell = np.array([plane.resolution_m for plane in matched.planes])
-    untold = untold_variance_m2(matched.window.from_last_m)
+    untold = untold_variance_m2(matched.window.path_m)
     atoms = cell_atoms(found.plane, found.row, found.column, matched.position_m, relative, cell[found.plane], untold)
     members = find_modes(found.plane, matched.position_m, matched.score, options.mlr_min_distance_m, _MODES)
     peaks = [int(group[0]) for group in members]
@@ -73,13 +73,19 @@ def believe(matched: Matched) -> Belief:
         BelievedMode(int(found.plane[k]), r.pose[0], float(r.log_l[0]), float(r.distance2[0]), float(s), r)
         for k, r, s in zip(peaks, refined, share, strict=True)
     ]
+    best = modes[0]
+    if matched.best != 0:
+        fine = _refine(matched, gaussian, matched.best)
+        best = BelievedMode(int(found.plane[matched.best]), fine.pose[0], float(fine.log_l[0]), float(fine.distance2[0]),
+                            float(atoms.mass[_nearest(atoms, int(found.plane[matched.best]), fine.pose[0, :2])]) / total,
+                            fine)  # fmt: skip
     elsewhere = off_map(matched)
     nowhere, poor = elsewhere.mass / (elsewhere.mass + total), _poorly_measured(matched, relative)
     atoms.mass = atoms.mass / total
     return Belief(
         atoms=atoms,
         modes=tuple(sorted(modes, key=lambda mode: -mode.probability)),
-        best=modes[0],
+        best=best,
         lattice_mass=relative / relative.sum(),
         unmapped=nowhere + (1.0 - nowhere) * poor,
         off_map_distance2=elsewhere.distance2,
@@ -88,9 +94,15 @@ def believe(matched: Matched) -> Belief:
     )
 
 
+def _nearest(atoms: Atoms, plane: int, position_m: Array) -> int:
+    distance = np.linalg.norm(atoms.position_m - position_m, axis=1)
+    return int(np.argmin(np.where(atoms.plane == plane, distance, np.inf)))
+
+
 def _missed(matched: Matched, total: float) -> float:
     """The share of the posterior the search left out, at most, as it is searched: with inflated variances."""
-    searched = np.exp(matched.candidates.score - matched.candidates.score.max())
+    scores = matched.candidates.score[np.isfinite(matched.candidates.score)]
+    searched = np.exp(scores - scores.max())
     return matched.candidates.missed_mass / (matched.candidates.missed_mass + float(searched.sum()))
 
 

@@ -31,6 +31,9 @@ class LocateOptions:
     abl_threshold: float | None = None  # None: the default of techniques.py, as a multiple of the uniform mass
     abl_bin_m: float = 2.0
     gate_probability: float = 0.997  # chi-square gate on the best pose (Shockley 8.5)
+    feature_rms_uT: float | None = (
+        None  # a feature whose best match is worse than this is unknown; None: the gate judges
+    )
     bias_sd_uT: float = 1.0
     step_scale_sd: float = 0.05
     heading_drift_sd_rad_per_m: float = 0.003
@@ -57,6 +60,7 @@ class MlEstimate:
     position_m: tuple[float, float, float]
     heading_rad: float | None
     log_likelihood: float
+    residual_rms_uT: float  # RSS / sqrt(n c) (Shockley 8.7), the sensor's estimated offset taken out
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +99,7 @@ class Mode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """The belief. `radius_*_m` are horizontal radii about `position_m` holding 68 and 95 % of the mass on that floor,
+    """The belief. `radius_*_m` are horizontal radii about `position_m` holding that share of the mass on that floor,
     position and covariance those of the strongest floor: the mean of its strongest mode, and the second moment of its
     mass about it. When less than half of the probability is on maps, or much of it was not weighed, radii and
     covariance are those of the whole searched area. `off_map_probability`: that less than half of the window was walked
@@ -107,7 +111,9 @@ class Posterior:
     floor_id: str
     position_m: tuple[float, float, float]
     covariance_m2: Array  # (2, 2)
+    radius_50_m: float
     radius_68_m: float
+    radius_90_m: float
     radius_95_m: float
     modes: tuple[Mode, ...] = field(default=())
     off_map_probability: float = 0.0

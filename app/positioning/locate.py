@@ -10,15 +10,24 @@ import numpy as np
 
 from app.errors import Fault, InvalidInput, InvalidWindow
 from app.field.grid import FieldGrid
-from app.positioning.belief import believe
+from app.positioning.belief import Belief, believe
+from app.positioning.explanation import Explanation, explain
 from app.positioning.features import common_components
 from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlrEstimate, Prior
 from app.positioning.floors import SearchableFloor, prepare_floor, prepare_floors, reduce_floor, shared_noise_sd_uT
-from app.positioning.matching import match
+from app.positioning.matching import Matched, match
 from app.positioning.verdict import conclude
 from app.positioning.window import Composition, Window
 
-__all__ = ["SearchableFloor", "locate", "prepare_floor", "prepare_floors", "shared_noise_sd_uT", "warm_up"]
+__all__ = [
+    "SearchableFloor",
+    "locate",
+    "locate_and_explain",
+    "prepare_floor",
+    "prepare_floors",
+    "shared_noise_sd_uT",
+    "warm_up",
+]
 
 TECHNIQUES = ("ml", "mlr", "abl")
 
@@ -40,24 +49,43 @@ def locate(
     so at once, otherwise they are prepared again here.
     Raises InvalidWindow, IncompatibleFrames (a map cannot answer this frame), InvalidInput (prior or options).
     """
-    options = options or LocateOptions()
+    return _answer(window, floors, composition, techniques, prior, options or LocateOptions())[0]
+
+
+def locate_and_explain(
+    window: Window,
+    floors: Sequence[SearchableFloor],
+    *,
+    composition: Composition = "raw",
+    techniques: Sequence[str] = TECHNIQUES,
+    prior: Prior | None = None,
+    options: LocateOptions | None = None,
+) -> tuple[Fix, Explanation | None]:
+    """`locate`, and why: None only where no floor had a map to search."""
+    fix, known = _answer(window, floors, composition, techniques, prior, options or LocateOptions())
+    return fix, explain(*known) if known else None
+
+
+def _answer(
+    window: Window,
+    floors: Sequence[SearchableFloor],
+    composition: Composition,
+    techniques: Sequence[str],
+    prior: Prior | None,
+    options: LocateOptions,
+) -> tuple[Fix, tuple[Matched, Belief] | None]:
     _check_window(window, composition)
     _check_options(prior, options)
     if not floors:
         nothing = "none of the floors asked for has a map to search; upload surveys and build one"
-        return Fix(
-            "unmapped",
-            nothing,
-            None,
-            MlrEstimate(False, None, reason=nothing),
-            AblEstimate(False, reason=nothing),
-            None,
-        )
+        unavailable = MlrEstimate(False, None, reason=nothing), AblEstimate(False, reason=nothing)
+        return Fix("unmapped", nothing, None, *unavailable, None), None
     shared = common_components(window.frame, {floor.floor_id: floor.components for floor in floors})
     noise_sd_uT = shared_noise_sd_uT([floor.grid for floor in floors])
     ready = [reduce_floor(floor, shared, noise_sd_uT) for floor in floors]
     matched = match(window, ready, shared, composition, prior, options)
-    return conclude(matched, believe(matched), techniques, options)
+    belief = believe(matched)
+    return conclude(matched, belief, techniques, options), (matched, belief)
 
 
 def warm_up() -> None:
@@ -117,6 +145,16 @@ def _check_options(prior: Prior | None, options: LocateOptions) -> None:
         "mlr_min_distance_m": options.mlr_min_distance_m,
         "abl_bin_m": options.abl_bin_m,
     }
+    known = {
+        "bias_sd_ut": options.bias_sd_uT,
+        "step_scale_sd": options.step_scale_sd,
+        "heading_drift_sd_rad_per_m": options.heading_drift_sd_rad_per_m,
+    }
+    faults += [
+        Fault(f"/options/{name}", "must be a finite number, not negative")
+        for name, value in known.items()
+        if not 0.0 <= value < np.inf
+    ]
     faults += [
         Fault(f"/options/{name}", "must be positive") for name, value in positive.items() if not 0.0 < value < np.inf
     ]

@@ -6,12 +6,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from app.errors import Fault, InvalidInput
 from app.field.error_structure import strictest
 from app.field.samples import Components
 from app.geometry import Array
+from app.positioning.feature_matching import feature_candidates, find_feature, with_aligned
 from app.positioning.fix import LocateOptions, Prior
 from app.positioning.floors import Plane, SearchableFloor
-from app.positioning.lattice import Courses, ReducedWindow, Turned, course_lattice, reduce_window, turn_window, widest_steps
+from app.positioning.lattice import (
+    Courses,
+    ReducedWindow,
+    Turned,
+    course_lattice,
+    reduce_window,
+    turn_window,
+    widest_steps,
+)
 from app.positioning.scoring import score_poses
 from app.positioning.search import Candidates, PosePrior, search
 from app.positioning.window import Composition, Window, course_yaw_rad
@@ -35,6 +45,8 @@ class Matched:
     candidates         poses of the lattice; position_m (n, 2) of the last sample
     score              (n,) log density of the window's features under the full covariance, plus log prior, best first
     distance2          (n,) its squared distance
+    best               the candidate that answers for maximum likelihood: the first, or of a feature the first whose peak
+                       lies on one of the map's
     pose_prior         of the position
     prior_mass         of the lattice under the priors, each pose weighing exp(log prior)
     """
@@ -47,12 +59,14 @@ class Matched:
     error: WindowError
     courses: Courses
     asked: Window
+    composition: Composition
     options: LocateOptions
     device_turn_rad: float | None
     candidates: Candidates
     position_m: Array
     score: Array
     distance2: Array
+    best: int
     pose_prior: PosePrior
     prior_mass: float
 
@@ -72,6 +86,10 @@ def match(
     reduced = _reduced(window, components, planes, structure.white_share * typical)
     known = composition in ("raw", "feature")
     bias_sd_uT = options.bias_sd_uT if known else None
+    feature = None
+    if composition == "feature":
+        feature = find_feature(reduced, float(np.sqrt(typical)))
+        reduced = feature.section
     error = window_error(reduced.path_m, reduced.noise_variance_uT2, typical, structure, bias_sd_uT)
     least = min(float(plane.pyramid.ladder_uT2[0]) for plane in planes)
     variance = error.inflation * (error.own_share * least + reduced.noise_variance_uT2)
@@ -82,18 +100,21 @@ def match(
         prior.position_m if prior else None, prior.sd_m if prior else 1.0, _walkable(floors, options)
     )
     kept = max(_KEPT_NATS, float(np.log(options.mlr_ratio)) + 1.0)
-    found = search(
-        planes, reduced, courses, pose_prior, error, window_nats=kept, out_of_time=options.out_of_time
-    )  # fmt: skip
+    found = search(planes, reduced, courses, pose_prior, error, window_nats=kept, out_of_time=options.out_of_time)
+    aligned = np.ones(len(found.plane), dtype=np.bool_)
+    if feature is not None:
+        found, aligned = with_aligned(found, feature_candidates(feature, planes, courses))
+    found, aligned = _kept_to(found, aligned, pose_prior)
     turned = tuple(turn_window(reduced, courses, plane.resolution_m) for plane in planes)
     if composition == "differenced":
-        error = replace(error, whiten=differenced(len(reduced)) @ np.eye(len(reduced)), log_det=0.0, offset_precision=None)
+        error = replace(
+            error, whiten=differenced(len(reduced)) @ np.eye(len(reduced)), log_det=0.0, offset_precision=None
+        )
     score, distance2 = _scored(planes, reduced, turned, found, error)
     position = _positions(planes, found)
     score = score + _log_prior(planes, found, courses, position, pose_prior)
     order = np.argsort(-score, kind="stable")
-    found = replace(found, plane=found.plane[order], course=found.course[order], row=found.row[order],
-                    column=found.column[order], score=found.score[order])  # fmt: skip
+    found, aligned = found.take(order), aligned[order]
     return Matched(
         floors=tuple(floors),
         planes=planes,
@@ -103,12 +124,14 @@ def match(
         error=error,
         courses=courses,
         asked=window,
+        composition=composition,
         options=options,
         device_turn_rad=None if window.frame == "building" else device_turn_rad(window),
         candidates=found,
         position_m=position[order],
         score=score[order],
         distance2=distance2[order],
+        best=int(np.argmax(aligned)),
         pose_prior=pose_prior,
         prior_mass=_prior_mass(planes, pose_prior, courses),
     )
@@ -121,9 +144,7 @@ def device_turn_rad(window: Window) -> float:
     return float(np.angle(np.exp(1j * course_yaw_rad(window.displacement_m)[-1])))
 
 
-def _reduced(
-    window: Window, components: Components, planes: Sequence[Plane], white_uT2: float
-) -> ReducedWindow:
+def _reduced(window: Window, components: Components, planes: Sequence[Plane], white_uT2: float) -> ReducedWindow:
     """Samples no nearer than a cell, and no more of them than tell anything new.
 
     White noise of a surveyor's sensor is part of what readings differ from the map by: the window's own counts where it
@@ -135,6 +156,18 @@ def _reduced(
     spacing_m = max(cell_m, min(length_m / _SAMPLES, _SPACING_M))
     reduced = reduce_window(window, components, spacing_m, planes[0].scale)
     return replace(reduced, noise_variance_uT2=np.maximum(reduced.noise_variance_uT2 - white_uT2, 0.0))
+
+
+def _kept_to(found: Candidates, aligned: NDArray[np.bool_], prior: PosePrior) -> tuple[Candidates, NDArray[np.bool_]]:
+    """The candidates the last sample may be at. Raises InvalidInput when there are none."""
+    kept = np.ones(len(found.plane), dtype=np.bool_)
+    for k, mask in enumerate(prior.walkable or ()):
+        here = found.plane == k
+        kept[here] = mask[found.row[here], found.column[here]]
+    if not kept.any():
+        reason = "no cell of the maps lies in the walkable area: check its coordinates, metres in the building frame"
+        raise InvalidInput(reason, Fault("/options/walkable", reason))
+    return (found, aligned) if kept.all() else (found.take(kept), aligned[kept])
 
 
 def _scored(

@@ -60,7 +60,9 @@ def off_map(matched: Matched) -> OffMap:
     plane, window, error = matched.planes[best], matched.window, matched.error
     floor = matched.floors[matched.plane_floor[best]]
     grid, scale2 = floor.grid, np.square(window.scale)
-    variance = scale2 * reduce_variance(grid.ambient_uT, np.square(grid.prior_sd_uT), grid.components, window.components)
+    variance = scale2 * reduce_variance(
+        grid.ambient_uT, np.square(grid.prior_sd_uT), grid.components, window.components
+    )
     noise = scale2 * reduce_variance(grid.ambient_uT, np.square(floor.noise_sd_uT), grid.components, window.components)
     sd = np.sqrt(error.own_share * float(noise.mean()) + window.noise_variance_uT2)
     correlated = sd[:, None] * error.correlation * sd

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from app.geometry import Array
 
 __all__ = [
-    "DISPLACEMENT_SD", "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius",
+    "DISPLACEMENT_SD_M", "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius",
     "mixture_points", "replace_narrow_mode", "untold_variance_m2",
 ]  # fmt: skip
 
 POSITION_SD_FLOOR_M = 0.03  # of the map's coordinates
-DISPLACEMENT_SD = 0.01  # of the distance from a window's middle to its end, beyond scale and drift
+DISPLACEMENT_SD_M = 0.03  # random walk of a window's displacements, per root of a metre
+_LEFT_AT_THE_END = 2.0 / 15.0  # of a random walk's variance, when its mean and trend are fitted out
 _RINGS, _SPOKES = 24, 12
 _MANY = 4000
 
@@ -37,10 +38,13 @@ class Atoms:
         return Atoms(self.plane[chosen], self.position_m[chosen], self.mass[chosen], self.covariance_m2[chosen])
 
 
-def untold_variance_m2(from_last_m: Array) -> float:
-    """Variance per axis of the last position that matching leaves, from the samples' positions (n, 2) from the last."""
-    lever = float(np.linalg.norm(from_last_m.mean(axis=0)))
-    return POSITION_SD_FLOOR_M**2 + (DISPLACEMENT_SD * lever) ** 2
+def untold_variance_m2(path_m: Array) -> float:
+    """Variance per axis of the last position that matching leaves, from the distances walked (n,).
+
+    Place, heading and scale of a window are fitted; what its displacements err beyond that is still in its last one.
+    """
+    length_m = float(path_m[-1] - path_m[0])
+    return POSITION_SD_FLOOR_M**2 + _LEFT_AT_THE_END * DISPLACEMENT_SD_M**2 * length_m
 
 
 def find_modes(

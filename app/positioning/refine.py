@@ -95,7 +95,9 @@ def refine_poses(
         if np.all(np.abs(step[:, :2]) < 1e-3):
             break
     covariance = _covariance(here.information, prior)
-    return Refined(pose, here.log_l, here.objective, here.distance2, covariance, here.residual, here.variance, here.bias)
+    return Refined(
+        pose, here.log_l, here.objective, here.distance2, covariance, here.residual, here.variance, here.bias
+    )
 
 
 def pose_fit(

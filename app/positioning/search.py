@@ -8,7 +8,7 @@ followed, the others but bounded.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,12 @@ class Candidates:
     complete: bool
     missed_mass: float
     poses: int
+
+    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "Candidates":
+        """Some of the poses, by index or mask."""
+        parts = (self.plane, self.course, self.row, self.column, self.score)
+        plane, course, row, column, score = (part[chosen] for part in parts)
+        return replace(self, plane=plane, course=course, row=row, column=column, score=score)
 
 
 class _PlaneCosts:
@@ -202,7 +208,9 @@ def search(
     says so; what that leaves out is counted in `missed_mass`, and `complete` says so.
     """
     walkable = prior.walkable or [None] * len(planes)
-    costs = [_PlaneCosts(plane, window, courses, prior, error, mask) for plane, mask in zip(planes, walkable, strict=True)]
+    costs = [
+        _PlaneCosts(plane, window, courses, prior, error, mask) for plane, mask in zip(planes, walkable, strict=True)
+    ]
     expected = max(on_plane.expected for on_plane in costs) + 2.0 * (window_nats + _SPARE_NATS)
     patience = _Patience(out_of_time)
     starts = [_start(on_plane, expected, patience) for on_plane in costs]

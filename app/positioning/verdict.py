@@ -5,9 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from app.geometry import Array, wrap_angle_rad
+from app.positioning.ambiguity import FARTHEST_M, walk_further
 from app.positioning.belief import Belief, BelievedMode
 from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlEstimate, MlrEstimate, Mode, Posterior, Status
 from app.positioning.matching import Matched
+from app.positioning.misfit import misfit, residual_rms_uT
 from app.positioning.posterior import mass_radius, mixture_points
 from app.positioning.techniques import (
     ABL_UNIFORM_MULTIPLE,
@@ -42,8 +44,9 @@ def _ml(matched: Matched, belief: Belief) -> MlEstimate:
     best = belief.best
     unscaled = best.log_l + len(matched.window) * float(np.log(matched.window.scale).sum())
     return MlEstimate(
-        _floor_id(matched, best.plane), _position(matched, best.plane, best.pose), _heading(matched, best), unscaled
-    )
+        _floor_id(matched, best.plane), _position(matched, best.plane, best.pose), _heading(matched, best), unscaled,
+        residual_rms_uT(matched, best.refined),
+    )  # fmt: skip
 
 
 def _mlr(matched: Matched, belief: Belief, options: LocateOptions) -> MlrEstimate:
@@ -99,21 +102,23 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
     plane, peak = peaks[0] if peaks else (int(here.plane[heaviest]), here.position_m[heaviest])
     points, mass = mixture_points(here)
     centre = _mode_mean(points, mass, peak)
-    r68, r95 = mass_radius(points, mass, centre, (0.68, 0.95))
+    radii = mass_radius(points, mass, centre, (0.5, 0.68, 0.9, 0.95))
     off = points - centre
     covariance = np.asarray((mass * off.T) @ off / mass.sum())
     if (
         belief.unmapped > 0.5 or _unweighed(matched, belief) > _MISSED
     ):  # what was weighed says little of where the window may be
-        r68 = r95 = _searched_radius_m(matched, strongest, centre)
+        radii = (_searched_radius_m(matched, strongest, centre),) * 4
         covariance = _searched_covariance_m2(matched, strongest, centre)
     return Posterior(
         floor_probability={floor_id: float(p) for floor_id, p in zip(ids, probability, strict=True)},
         floor_id=ids[strongest],
         position_m=_position(matched, plane, centre),
         covariance_m2=covariance,
-        radius_68_m=r68,
-        radius_95_m=r95,
+        radius_50_m=radii[0],
+        radius_68_m=radii[1],
+        radius_90_m=radii[2],
+        radius_95_m=radii[3],
         modes=tuple(
             Mode(
                 _floor_id(matched, mode.plane), _position(matched, mode.plane, mode.pose), _heading(matched, mode),
@@ -139,11 +144,17 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
             "on into mapped corridors, or survey where this was recorded; if it was recorded on mapped ground, "
             "calibrate the magnetometer or use composition demeaned"
         )
+    rms_uT, most_uT = residual_rms_uT(matched, belief.best.refined), options.feature_rms_uT
+    if matched.composition == "feature" and most_uT is not None and rms_uT > most_uT:
+        return "inconsistent", (
+            f"no feature of the map is like this one: the best differs by {rms_uT:.1f} uT rms, not {most_uT:g}; walk on to "
+            "another, or use composition raw"
+        )
     if distance2 > limit:
         return "inconsistent", (
-            f"even the best match is worse than chance allows (chi-square {distance2:.1f}, limit {limit:.1f}); check "
-            "units, frame and calibration, or whether the building changed since the survey; composition demeaned "
-            "removes an offset"
+            f"even the best match is worse than chance allows (chi-square {distance2:.1f}, limit {limit:.1f}"
+            f"{''.join('; ' + what for what in [misfit(matched, belief)] if what)}); check units, frame and calibration, "
+            "or whether the building changed since the survey; composition demeaned removes an offset"
         )
     if _unweighed(matched, belief) > 0.5:
         return "ambiguous", (
@@ -153,10 +164,24 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
     strongest = belief.modes[0].probability * (1.0 - belief.unmapped) * (1.0 - _unweighed(matched, belief))
     if strongest < _CERTAIN:
         return "ambiguous", (
-            f"the strongest place holds only {strongest:.2f} of the probability; walk further, turn a corner, or send "
-            "a prior position or heading"
+            f"the strongest place holds only {strongest:.2f} of the probability; {_advice(matched, belief)}, or send a "
+            "prior position or heading"
         )
     return "fix", None
+
+
+def _advice(matched: Matched, belief: Belief) -> str:
+    """How much farther to walk, if the map can tell."""
+    further = walk_further(matched, belief)
+    if further is None:
+        return "walk further or turn a corner"
+    places = "one other place is" if further.rivals == 1 else f"{further.rivals} other places are"
+    apart = "" if further.apart_m is None else f" (the nearest {further.apart_m:.0f} m away)"
+    if further.distance_m is None:
+        return (
+            f"{places} as likely{apart} and alike straight ahead for {FARTHEST_M:.0f} m: walk further and turn a corner"
+        )
+    return f"{places} nearly as likely{apart}; walk further, about {further.distance_m:.0f} m straight ahead, to tell"
 
 
 def _unweighed(matched: Matched, belief: Belief) -> float:

@@ -1,9 +1,10 @@
 """One covariance for the errors of a window: a constant offset, errors alike along the walk, white noise.
 
 At the right pose the residuals r_i = z_i - m(p_i), turned to the sensor's axes, have per component the covariance
-    C = D^1/2 R D^1/2 + s_b^2 1 1',     D = diag((1 - a) V_i + noise_i),     R_ij = w exp(-|path_i - path_j| / l), R_ii = 1,
-where V_i is the variance of one measurement about the map there, a, w and l the structure of errors that surveys left
-out have shown (`ErrorStructure`: the constant share a is part of s_b^2), and s_b what is not known of the sensor's offset.
+    C = D^1/2 R D^1/2 + s_b^2 1 1',     D = diag((w + u) V_i + noise_i),     R_ij = w' exp(-|path_i - path_j| / l), R_ii = 1,
+where V_i is the variance of one measurement about the map there, w, u and l the shares of walk and white noise and the
+length that surveys left out have shown (`ErrorStructure`; the constant share is part of s_b^2), w' the part of D that is
+walk noise, and s_b what is not known of the sensor's offset.
 
 The search scores with f D + s_b^2 1 1', f the largest eigenvalue of R: that covariance dominates C, so the squared
 distance of a pose under the model is never less than the one it was searched by. Poses that were found are then scored
@@ -55,11 +56,11 @@ def window_error(
 
     bias_sd_uT: what is not known of the sensor's offset; None: nothing is known (a flat prior, "demeaned").
     """
-    own = 1.0 - structure.constant_share
+    own = structure.walk_share + structure.white_share
     white = float(np.mean(noise_uT2))
     share = structure.walk_share * map_variance_uT2 / (own * map_variance_uT2 + white)
     apart = np.abs(path_m[:, None] - path_m[None, :])
-    R = min(share, 1.0) * np.exp(-apart / structure.walk_length_m)
+    R = share * np.exp(-apart / structure.walk_length_m)
     np.fill_diagonal(R, 1.0)
     precision: float | None = 0.0
     if bias_sd_uT is not None:

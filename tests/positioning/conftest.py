@@ -19,7 +19,7 @@ AMBIENT = {
     "norm": np.array([46.7]),
 }
 Array = NDArray[np.float64]
-WHITE = ErrorStructure(0.0, 0.0, 1.0)
+WHITE = ErrorStructure(0.0, 0.0, 1.0, 1.0)
 
 
 def make_grid(
@@ -112,7 +112,9 @@ def make_walk(
         B = B @ back.T if B.shape[1] == 3 else B
     if B.shape[1] == 3 and offset_uT:  # constant in the device's axes, which turn with the course
         turned = course - (yaw if frame != "building" else 0.0)
-        B = B + offset_uT * np.column_stack([np.cos(turned) - np.sin(turned), np.sin(turned) + np.cos(turned), turned**0])
+        B = B + offset_uT * np.column_stack(
+            [np.cos(turned) - np.sin(turned), np.sin(turned) + np.cos(turned), turned**0]
+        )
     if frame == "norm" and B.shape[1] > 1:
         B = np.linalg.norm(B, axis=1, keepdims=True)
     window = Window(frame, B, d, noise_uT, yaw_rad=course - yaw)  # type: ignore[arg-type]

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from app.positioning.lattice import course_lattice, heading_lattice, reduce_window, single_course, turn_window, widest_steps
+from app.positioning.lattice import (
+    course_lattice,
+    heading_lattice,
+    reduce_window,
+    single_course,
+    turn_window,
+    widest_steps,
+)
 from app.positioning.matching import device_turn_rad
 from app.positioning.window import Window
 

@@ -347,7 +347,11 @@ def test_the_strongest_floor_may_be_strong_by_area_alone(grid_of: Callable) -> N
     displacement = np.column_stack([np.linspace(0, 1.0, 3), np.zeros((3, 2))])
     field = np.tile(small.mean_uT[0, 0, 0].astype(float), (3, 1))
     window = Window("building", field, displacement, 0.4)
-    fix = locate(window, [prepare_floor("small", small), prepare_floor("wide", off_by_a_little)])
+    floors, sure = (
+        [prepare_floor("small", small), prepare_floor("wide", off_by_a_little)],
+        LocateOptions(bias_sd_uT=0.0),
+    )
+    fix = locate(window, floors, options=sure)
     assert fix.posterior is not None
     assert fix.posterior.floor_id == "wide"
     assert fix.ml is not None

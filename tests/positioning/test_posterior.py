@@ -66,7 +66,12 @@ def test_only_modes_narrower_than_a_cell_are_replaced() -> None:
     np.testing.assert_allclose(fine.covariance_m2[1], (0.05**2 + 0.0009) * np.eye(2))
 
 
-def test_long_windows_leave_more_untold() -> None:
-    short, long = (np.column_stack([np.linspace(-n, 0, 9), np.zeros(9)]) for n in (1.0, 20.0))
-    assert untold_variance_m2(np.zeros((1, 2))) > 0.0
-    assert untold_variance_m2(long) > untold_variance_m2(short)
+def test_what_a_fit_leaves_of_a_random_walk_at_its_end() -> None:
+    """Place, trend (heading and scale) fitted out of a random walk: the variance left at its end, by simulation."""
+    rng, n, length_m = np.random.default_rng(0), 400, 20.0
+    path = np.linspace(0.0, length_m, n)
+    walks = np.cumsum(rng.normal(0.0, 0.03 * np.sqrt(length_m / n), (4000, n)), axis=1)
+    design = np.column_stack([np.ones(n), path])
+    left = walks - walks @ design @ np.linalg.solve(design.T @ design, design.T)
+    assert untold_variance_m2(path) - untold_variance_m2(path[:1]) == pytest.approx(left[:, -1].var(), rel=0.1)
+    assert untold_variance_m2(path[:1]) > 0.0

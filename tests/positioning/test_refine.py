@@ -42,7 +42,7 @@ def test_gradient_is_that_of_the_objective(components: str, grid_of: Callable, w
     prior = PoseGaussian(np.array([1.0, 12.0, 0.3, 0.0, 0.0]), np.array([0.1, 0.1, 2.0, 400.0, 1e4]), np.ones(5))
     pose = np.array([[*walked.position_m, walked.yaw_rad, 0.0, 0.0]]) + [0.05, 0.05, 0.05, 0.02, 0.005]
     path = window.path_m
-    structure = ErrorStructure(0.1, 0.5, 1.5)
+    structure = ErrorStructure(0.1, 0.5, 0.4, 1.5)
     error = window_error(path, window.noise_variance_uT2, 1.0, structure, 1.0)
 
     def objective(at: np.ndarray) -> float:

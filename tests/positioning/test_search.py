@@ -26,6 +26,7 @@ from app.positioning.search import PosePrior, search
 from app.positioning.window import Window
 from app.positioning.window_error import WindowError, plain_error
 
+
 def exhaustive_scores(
     plane: Plane, window: ReducedWindow, courses: Courses, prior: PosePrior, error: WindowError
 ) -> np.ndarray:
@@ -47,7 +48,11 @@ def exhaustive_scores(
             mean = np.where(inside[..., None], plane.mean_uT[at], plane.ambient_uT.astype(np.float32)).astype(float)
             variance = np.where(inside, plane.variance_uT2[at], np.float32(plane.off_map_variance_uT2)).astype(float)
             yaw = courses.heading_rad[h] + courses.drift_rad_per_m[h] * along[k] if window.turns else 0.0
-            r = yaw_matrix(yaw) @ window.features_uT[k] - mean if len(plane.scale) == 3 else window.features_uT[k] - mean
+            r = (
+                yaw_matrix(yaw) @ window.features_uT[k] - mean
+                if len(plane.scale) == 3
+                else window.features_uT[k] - mean
+            )
             if len(plane.scale) == 3:
                 r = (r @ yaw_matrix(yaw + window.yaw_rad[k])) @ (window.tilt[k].T if len(window.tilt) else np.eye(3))
             residuals.append(r)
@@ -170,7 +175,13 @@ def test_when_time_ends_what_was_missed_is_bounded(grid_of: Callable, walk_on: C
     for looks in (0, 1, 3):
         left = iter([False] * looks)
         found = search(
-            planes, window, courses, PosePrior(), error, window_nats=10.0, out_of_time=lambda left=left: next(left, True)
+            planes,
+            window,
+            courses,
+            PosePrior(),
+            error,
+            window_nats=10.0,
+            out_of_time=lambda left=left: next(left, True),
         )
         assert not found.complete
         assert len(found.score) >= 1
@@ -234,9 +245,7 @@ def test_pyramid_bounds_enclose_every_square(ny: int, nx: int) -> None:
 
 
 @pytest.mark.parametrize("precision", [None, 0.0])
-def test_a_spent_budget_leaves_a_valid_bound(
-    precision: float | None, grid_of: Callable, walk_on: Callable
-) -> None:
+def test_a_spent_budget_leaves_a_valid_bound(precision: float | None, grid_of: Callable, walk_on: Callable) -> None:
     """However little work is allowed: the mass left out stays bounded, and the answer does not claim completeness."""
     rng = np.random.default_rng(7)
     planes = prepare_floor("a", grid_of(rng, (40, 40), field_sd_uT=1.0)).planes

@@ -45,7 +45,10 @@ def test_a_flat_offset_is_integrated_out() -> None:
     rng = np.random.default_rng(0)
     residual, variance = rng.normal(3.0, 1.0, (5, 1)), rng.uniform(0.5, 4.0, 5)
     integral, _ = quad(
-        lambda b: float(np.exp(weigh_residuals(residual - b, variance, plain_error(5)).log_l)), -20.0, 20.0, points=[3.0]
+        lambda b: float(np.exp(weigh_residuals(residual - b, variance, plain_error(5)).log_l)),
+        -20.0,
+        20.0,
+        points=[3.0],
     )
     assert weigh_residuals(residual, variance, plain_error(5, 0.0)).log_l == pytest.approx(np.log(integral), abs=1e-6)
 
@@ -65,9 +68,9 @@ def test_is_the_density_of_the_covariance_it_states(
     rng = np.random.default_rng(seed)
     path, noise = np.cumsum(rng.uniform(0.0, 0.7, n)), rng.uniform(0.0, 0.5, n)
     typical = 2.0
-    error = window_error(path, noise, typical, ErrorStructure(constant, walk, length_m), bias_sd_uT)
+    error = window_error(path, noise, typical, ErrorStructure(constant, walk, 0.4, length_m), bias_sd_uT)
     residual, variance = rng.normal(0.0, 2.0, (n, 2)), rng.uniform(0.5, 3.0, n)
-    share = walk * typical / ((1.0 - constant) * typical + noise.mean())
+    share = walk * typical / ((walk + 0.4) * typical + noise.mean())
     R = share * np.exp(-np.abs(path[:, None] - path[None, :]) / length_m)
     np.fill_diagonal(R, 1.0)
     C = np.sqrt(variance)[:, None] * R * np.sqrt(variance) + bias_sd_uT**2 + constant * typical
