@@ -88,7 +88,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
-    for part in (health, buildings, surveys, maps, localizability, locate, jobs):
+    # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
+    for part in (locate, health, buildings, surveys, maps, localizability, jobs):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)
