@@ -1,6 +1,9 @@
 """The composition root of the web process: settings in, one FastAPI application out."""
 
+import gc
+import os
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from threading import Thread
 
@@ -32,6 +35,9 @@ magnetometer samples. Lengths are metres, field microtesla, angles radians, time
 is. Errors are RFC 9457 problem documents."""
 
 
+MOST_SEARCHES = 4  # at once: a search holds Python's one lock part of its time, so that more only wait for each other
+
+
 def first_start(settings: Settings) -> str | None:
     """Make the data folder, bring the database to today's schema and see to an admin key.
 
@@ -60,6 +66,7 @@ def open_context(settings: Settings) -> Context:
         grids=GridCache(blobs, settings.grid_cache_bytes),
         metrics=Metrics(),
         keys=KeyRing(sessions),
+        searches=ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
     )
 
 
@@ -70,7 +77,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        Thread(target=warm_up, name="warm-up", daemon=True).start()
+        Thread(target=_get_ready, name="warm-up", daemon=True).start()
         yield
         await viewer.close()
         await run_in_threadpool(context.queue.close)
@@ -81,7 +88,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
-    for part in (health, buildings, surveys, maps, localizability, locate, jobs):
+    # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
+    for part in (locate, health, buildings, surveys, maps, localizability, jobs):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)
@@ -91,6 +99,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=context.metrics)
     _describe_problems(app)
     return app
+
+
+def _get_ready() -> None:
+    """Warm up, then let the garbage collector forget all that is there by now.
+
+    These objects (modules, compiled kernels, the application) stay as long as the process. To look through them stops
+    every thread for more than 0.1 s, and a busy server would do so about once a second.
+    """
+    warm_up()
+    gc.collect()
+    gc.freeze()
 
 
 def _to_the_page() -> RedirectResponse:

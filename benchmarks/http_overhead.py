@@ -18,7 +18,6 @@ import numpy as np
 from sqlalchemy import select
 from threadpoolctl import threadpool_limits
 
-from app.db.engine import create_database_engine, session_factory
 from app.db.tables import Organisation
 from app.geometry import yaw_matrix
 from app.main import open_context
@@ -99,10 +98,9 @@ def compare(port: int, folder: Path, ready_s: list[float]) -> int:
 
     settings = Settings(data_dir=folder)
     context = open_context(settings)
-    sessions = session_factory(create_database_engine(settings.resolved_database_url))
-    with sessions() as session:
-        organisation = session.scalars(select(Organisation.id).where(Organisation.name == "default")).one()
-        maps = active_maps(session, organisation, floor_ids=[floor])
+    with context.engine.connect() as connection:
+        organisation = connection.scalars(select(Organisation.id).where(Organisation.name == "default")).one()
+        maps = active_maps(connection, organisation, floor_ids=[floor])
 
     def in_process() -> object:
         return locate_window(maps, context.grids, window, composition="raw", techniques=("ml", "mlr", "abl"),

@@ -1,6 +1,7 @@
 """What every endpoint may use, made once by `app.main` and found on the application's state."""
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,7 +22,10 @@ __all__ = ["Context", "ContextDep", "context_of"]
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The open handles of a web process."""
+    """The open handles of a web process.
+
+    `searches` runs the searches for positions: few at once, the others wait in order of arrival.
+    """
 
     settings: Settings
     engine: Engine
@@ -31,6 +35,7 @@ class Context:
     grids: GridCache
     metrics: Metrics
     keys: KeyRing
+    searches: Executor
 
     @contextmanager
     def transaction(self) -> Iterator[Session]:

@@ -1,10 +1,13 @@
 """Where am I? A window of magnetometer samples in, a fix out. Nothing is written, nothing queued."""
 
+import asyncio
+from collections.abc import Callable
+from functools import partial
 from time import perf_counter
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 from sqlalchemy import select
 
@@ -180,6 +183,8 @@ class PosteriorView(BaseModel):
 
 
 class Timing(BaseModel):
+    """Milliseconds: the search; and all from when the request was read, waiting for its turn included."""
+
     search: float
     total: float
 
@@ -198,45 +203,51 @@ class BatchAnswer(BaseModel):
     fixes: list[FixView]
 
 
-@router.post("/buildings/{building_id}/locate", summary="Locate a window anywhere in a building")
-def locate_in_building(building_id: Id, body: LocateBody, context: ContextDep, identity: Locating) -> FixView:
+@router.post(
+    "/buildings/{building_id}/locate", response_model=FixView, summary="Locate a window anywhere in a building"
+)
+async def locate_in_building(building_id: Id, body: LocateBody, context: ContextDep, identity: Locating) -> Response:
     """Every floor with an active map is searched, or those in `floor_ids`."""
+    return _json(await _in_turn(context, partial(_building_maps, context, identity, building_id), body))
+
+
+@router.post("/floors/{floor_id}/locate", response_model=FixView, summary="Locate a window on one floor")
+async def locate_on_floor(floor_id: Id, body: LocateBody, context: ContextDep, identity: Locating) -> Response:
+    return _json(await _in_turn(context, partial(_floor_maps, context, identity, floor_id), body))
+
+
+@router.post(
+    "/buildings/{building_id}/locate:batch", response_model=BatchAnswer, summary="Locate many windows in a building"
+)
+async def locate_batch_in_building(
+    building_id: Id, body: BatchBody, context: ContextDep, identity: Locating
+) -> Response:
+    find_maps = partial(_building_maps, context, identity, building_id)
+    return _json(BatchAnswer(fixes=[await _in_turn(context, find_maps, query) for query in body.queries]))
+
+
+@router.post("/floors/{floor_id}/locate:batch", response_model=BatchAnswer, summary="Locate many windows on one floor")
+async def locate_batch_on_floor(floor_id: Id, body: BatchBody, context: ContextDep, identity: Locating) -> Response:
+    find_maps = partial(_floor_maps, context, identity, floor_id)
+    return _json(BatchAnswer(fixes=[await _in_turn(context, find_maps, query) for query in body.queries]))
+
+
+async def _in_turn(context: Context, find_maps: Callable[[LocateBody], list[ActiveMap]], body: LocateBody) -> FixView:
+    """One window's answer, when its turn comes. A batch queues anew for each of its windows: others come in between."""
     start = perf_counter()
-    maps = _building_maps(context, identity, building_id, body.floor_ids)
-    return _locate(context, maps, body, start)
+    loop = asyncio.get_running_loop()
+    return await loop.run_in_executor(context.searches, lambda: _locate(context, find_maps(body), body, start))
 
 
-@router.post("/floors/{floor_id}/locate", summary="Locate a window on one floor")
-def locate_on_floor(floor_id: Id, body: LocateBody, context: ContextDep, identity: Locating) -> FixView:
-    start = perf_counter()
-    return _locate(context, _floor_maps(context, identity, floor_id, body), body, start)
+def _json(answer: BaseModel) -> Response:
+    """A response as it goes out. FastAPI would check the model, which was checked as it was made, once more."""
+    return Response(answer.model_dump_json(), media_type="application/json")
 
 
-@router.post("/buildings/{building_id}/locate:batch", summary="Locate many windows in a building")
-def locate_batch_in_building(building_id: Id, body: BatchBody, context: ContextDep, identity: Locating) -> BatchAnswer:
-    fixes = []
-    for query in body.queries:
-        start = perf_counter()
-        maps = _building_maps(context, identity, building_id, query.floor_ids)
-        fixes.append(_locate(context, maps, query, start))
-    return BatchAnswer(fixes=fixes)
-
-
-@router.post("/floors/{floor_id}/locate:batch", summary="Locate many windows on one floor")
-def locate_batch_on_floor(floor_id: Id, body: BatchBody, context: ContextDep, identity: Locating) -> BatchAnswer:
-    fixes = []
-    for query in body.queries:
-        start = perf_counter()
-        fixes.append(_locate(context, _floor_maps(context, identity, floor_id, query), query, start))
-    return BatchAnswer(fixes=fixes)
-
-
-def _building_maps(
-    context: Context, identity: Identity, building_id: str, floor_ids: list[str] | None
-) -> list[ActiveMap]:
-    with context.transaction() as session:
-        maps = active_maps(session, identity.organisation_id, building_id=building_id, floor_ids=floor_ids)
-        if not maps and session.scalars(
+def _building_maps(context: Context, identity: Identity, building_id: str, body: LocateBody) -> list[ActiveMap]:
+    with context.engine.connect() as connection:
+        maps = active_maps(connection, identity.organisation_id, building_id=building_id, floor_ids=body.floor_ids)
+        if not maps and connection.scalars(
             select(Building.id).where(Building.id == building_id, Building.organisation_id == identity.organisation_id)
         ).first() is None:  # fmt: skip
             raise NotFound(f"no building {building_id}")
@@ -246,8 +257,8 @@ def _building_maps(
 def _floor_maps(context: Context, identity: Identity, floor_id: str, body: LocateBody) -> list[ActiveMap]:
     if body.floor_ids is not None and body.floor_ids != [floor_id]:
         raise InvalidInput("floor_ids is for buildings", Fault("/body/floor_ids", "leave it out on a floor"))
-    with context.transaction() as session:
-        return active_maps(session, identity.organisation_id, floor_ids=[floor_id])
+    with context.engine.connect() as connection:
+        return active_maps(connection, identity.organisation_id, floor_ids=[floor_id])
 
 
 def _locate(context: Context, maps: list[ActiveMap], body: LocateBody, start: float) -> FixView:
