@@ -13,7 +13,8 @@ from scipy.special import gammaincinv
 from app.geometry import Array
 
 __all__ = [
-    "ABL_UNIFORM_MULTIPLE", "Bin", "Rival", "best_bin", "chi_square_limit", "likelihood_rival", "peak_over_uniform",
+    "ABL_UNIFORM_MULTIPLE", "Bin", "Rival", "StretchBin", "best_bin", "best_stretch_bin", "chi_square_limit",
+    "likelihood_rival", "normalised_mass", "peak_over_uniform",
 ]  # fmt: skip
 
 ABL_UNIFORM_MULTIPLE = 100.0  # ABL answers when the likeliest cell holds this many times the uniform mass
@@ -32,6 +33,24 @@ class Bin(NamedTuple):
     mass: float
     row: float
     column: float
+
+
+class StretchBin(NamedTuple):
+    """The heaviest bin along a list of samples: its mass, its samples `first` to `stop` (excluded), and their mean.
+
+    `position_m` (d,) is the likelihood-weighted mean of the samples' positions.
+    """
+
+    mass: float
+    first: int
+    stop: int
+    position_m: Array
+
+
+def normalised_mass(log_l: Array) -> Array:
+    """Likelihoods (..., m) as shares of their sum, whatever their scale (Shockley 8.3)."""
+    weight = np.exp(log_l - log_l.max(axis=-1, keepdims=True))
+    return np.asarray(weight / weight.sum(axis=-1, keepdims=True))
 
 
 def likelihood_rival(
@@ -58,6 +77,24 @@ def best_bin(mass: Array, cells: int) -> Bin:
     row = j + float(inside.sum(axis=1) @ np.arange(rows)) / total
     column = i + float(inside.sum(axis=0) @ np.arange(columns)) / total
     return Bin(total, row, column)
+
+
+def best_stretch_bin(
+    mass: Array, along_m: Array, stretch: NDArray[np.int64], position_m: Array, width_m: float
+) -> StretchBin:
+    """The window of `width_m` along a list of samples with the most mass (m,) in it (Shockley 8.3, L1096).
+
+    Windows begin at each sample, hold its end no more, and never leave its stretch; `along_m` (m,) increases within a
+    stretch, `stretch` (m,) increases; `position_m` (m, d). In metres, so that uneven spacing does not matter.
+    """
+    step = float(along_m.max() - along_m.min()) + 2.0 * width_m
+    key = along_m - along_m.min() + stretch * step
+    stop = np.searchsorted(key, key + width_m * (1.0 - 1e-9), side="left")
+    sums = np.concatenate([[0.0], np.cumsum(mass)])
+    first = int(np.argmax(sums[stop] - sums[:-1]))
+    inside = slice(first, int(stop[first]))
+    total = float(mass[inside].sum())
+    return StretchBin(total, first, inside.stop, mass[inside] @ position_m[inside] / total)
 
 
 def peak_over_uniform(mass: Array, cells: int) -> float:

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from app.positioning.techniques import (
     best_bin,
+    best_stretch_bin,
     chi_square_limit,
     likelihood_rival,
+    normalised_mass,
     peak_over_uniform,
 )
 
@@ -39,6 +43,50 @@ def test_bins_prefer_the_broad_region(log_l: np.ndarray, cells: int, mass: float
         found = best_bin(table, cells)
         assert found.mass == pytest.approx(mass, rel=1e-5)
         assert max(found.row, found.column) == pytest.approx(12.0, abs=0.3)
+
+
+@pytest.mark.parametrize(("width_m", "mass"), [(3.0, 0.390118), (5.0, 0.594719), (7.0, 0.717556)])
+def test_bins_along_a_road_prefer_the_broad_region(log_l: np.ndarray, width_m: float, mass: float) -> None:
+    share = normalised_mass(log_l)
+    along_m = np.arange(60.0)
+    found = best_stretch_bin(share, along_m, np.zeros(60, dtype=np.int64), along_m[:, None], width_m)
+    assert found.mass == pytest.approx(mass, rel=1e-5)
+    assert (found.first + found.stop - 1) / 2 == 12.0
+    assert found.stop - found.first == width_m
+    assert found.position_m[0] == pytest.approx(12.0, abs=0.3)
+
+
+def test_bins_do_not_reach_over_the_joint_of_two_roads(log_l: np.ndarray) -> None:
+    stretch, along_m = np.repeat([0, 1], [12, 48]), np.concatenate([np.arange(12.0), np.arange(48.0)])
+    position_m = np.stack([along_m, 50.0 * stretch], axis=1)  # the broad region is cut between its samples 11 and 12
+    found = best_stretch_bin(normalised_mass(log_l), along_m, stretch, position_m, 7.0)
+    assert (found.first, found.stop) == (12, 19)
+    assert found.position_m[1] == pytest.approx(50.0)
+
+
+@given(st.integers(0, 200), st.floats(0.3, 9.0))
+def test_best_bin_along_a_road_as_by_hand(seed: int, width_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    lengths = rng.integers(1, 9, size=3)
+    stretch = np.repeat(np.arange(3), lengths)
+    along_m = np.concatenate([rng.uniform(-5.0, 5.0) + np.cumsum(rng.uniform(0.1, 2.0, n)) for n in lengths])
+    mass = rng.dirichlet(np.ones(len(stretch)))
+    heaviest = max(
+        sum(
+            mass[j]
+            for j in range(i, len(mass))
+            if stretch[j] == stretch[i] and along_m[j] - along_m[i] < width_m * (1 - 1e-9)
+        )
+        for i in range(len(mass))
+    )
+    found = best_stretch_bin(mass, along_m, stretch, along_m[:, None], width_m)
+    assert found.mass == pytest.approx(heaviest)
+    assert found.mass == pytest.approx(mass[found.first : found.stop].sum())
+    assert along_m[found.first] - 1e-9 <= found.position_m[0] <= along_m[found.stop - 1] + 1e-9
+
+
+def test_mass_survives_likelihoods_that_underflow() -> None:
+    np.testing.assert_allclose(normalised_mass(np.array([-5000.0, -5000.0 + np.log(3.0)])), [0.25, 0.75])
 
 
 def test_no_rival_where_the_map_ends() -> None:

@@ -1,0 +1,1 @@
+"""What `shockley_orderings.py` is made of."""
