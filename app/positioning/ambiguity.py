@@ -61,10 +61,9 @@ def _continued(matched: Matched, mode: BelievedMode, ahead_m: Array) -> tuple[Ar
     """Features (k, c) in the device's frame straight ahead of a mode, and the variances (k,) of readings there."""
     plane = matched.planes[mode.plane]
     floor = matched.floors[matched.plane_floor[mode.plane]]
-    half_m = 0.5 * float(matched.window.path_m[-1] - matched.window.path_m[0])
-    course = float(mode.pose[2] + mode.pose[4] * half_m) + (matched.device_turn_rad or 0.0)
-    if matched.device_turn_rad is None and len(matched.window) > 1:  # a building window: on along its own course
-        moved = matched.window.from_last_m[-1] - matched.window.from_last_m[-2]
+    course = matched.device_heading_rad(mode.pose)
+    if course is None:  # a building window: on along its own course
+        moved = matched.window.from_last_m[-1] - matched.window.from_last_m[max(len(matched.window) - 2, 0)]
         course = float(np.arctan2(moved[1], moved[0]))
     c, s = np.cos(course), np.sin(course)
     points = np.column_stack([

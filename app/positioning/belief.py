@@ -3,17 +3,29 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.positioning.matching import Matched
 from app.positioning.off_map import off_map
-from app.positioning.posterior import Atoms, cell_atoms, find_modes, replace_narrow_mode, untold_variance_m2
+from app.positioning.posterior import (
+    Atoms,
+    NarrowMode,
+    cell_atoms,
+    distinct_poses,
+    replace_narrow_modes,
+    untold_variance_m2,
+)
 from app.positioning.refine import POSE, PoseGaussian, Refined, refine_poses
 from app.positioning.scoring import pose_residuals
 
 __all__ = ["Belief", "BelievedMode", "believe"]
 
+MODES_APART_M = 2.0  # nearer places are one
 _MODES = 8
+_STARTS = 40  # candidates that are refined
+START_APART_M, START_APART_RAD = 1.0, 0.35  # places and headings that have an optimum of their own
+_SAME_M, _SAME_RAD = 0.1, 0.05
 _HEAVY_POSES = 2000  # enough poses to judge how much of the window was measured
 
 
@@ -33,6 +45,7 @@ class BelievedMode:
 class Belief:
     """atoms: normalised mass over places. modes: strongest first. best: the mode of the most likely pose, refined.
 
+    log_ratio      of the best optimum and the best one elsewhere; None where nothing was found elsewhere
     lattice_mass   (n,) share of each candidate pose, as the techniques take them
     unmapped       probability that nothing is mapped where the window was walked, or less than half of it
     off_map_distance2, off_map_scalars    how well the prior field explains the window: a chi-square and its freedom
@@ -43,6 +56,7 @@ class Belief:
     modes: tuple[BelievedMode, ...]
     best: BelievedMode
     lattice_mass: Array
+    log_ratio: float | None
     unmapped: float
     off_map_distance2: float
     off_map_scalars: float
@@ -50,36 +64,30 @@ class Belief:
 
 
 def believe(matched: Matched) -> Belief:
-    """Sum, refine and normalise the candidates' posterior."""
-    found, options = matched.candidates, matched.options
-    relative = np.exp(matched.score - matched.score[0])
+    """Refine, sum and normalise the candidates' posterior."""
+    found = matched.candidates
+    gaussian = pose_gaussian(matched)
+    optima = _optima(matched, gaussian)
+    peak = max(optima[0].objective, float(matched.score[0]))
+    relative = np.exp(matched.score - peak)
     cell = np.array([plane.resolution_m for plane in matched.planes])
     untold = untold_variance_m2(matched.window.path_m)
     atoms = cell_atoms(found.plane, found.row, found.column, matched.position_m, relative, cell[found.plane], untold)
-    members = find_modes(found.plane, matched.position_m, matched.score, options.mlr_min_distance_m, _MODES)
-    peaks = [int(group[0]) for group in members]
-    gaussian = pose_gaussian(matched)
-    refined = [_refine(matched, gaussian, peak) for peak in peaks]
-    for peak, fine in zip(peaks, refined, strict=True):
-        plane = int(found.plane[peak])
-        mass = _laplace_mass(matched, gaussian, plane, fine)
-        atoms = replace_narrow_mode(
-            atoms, plane, fine.pose[0, :2], fine.covariance[0, :2, :2], mass, float(cell[plane]), untold
-        )
+    atoms = replace_narrow_modes(atoms, [
+        NarrowMode(each.plane, each.fine.pose[0, :2], each.fine.covariance[0, :2, :2],
+                   _laplace_mass(matched, gaussian, each, peak), float(cell[each.plane]))
+        for each in optima
+    ], untold)  # fmt: skip
     total = float(atoms.mass.sum())
-    share = _mode_masses(atoms, [(int(found.plane[k]), r.pose[0, :2]) for k, r in zip(peaks, refined, strict=True)],
-                         options.mlr_min_distance_m) / total  # fmt: skip
-    modes = [
-        BelievedMode(int(found.plane[k]), r.pose[0], float(r.log_l[0]), float(r.distance2[0]), float(s), r)
-        for k, r, s in zip(peaks, refined, share, strict=True)
-    ]
+    leaders = _leaders(optima)
+    share = _mode_masses(atoms, [(each.plane, each.fine.pose[0, :2]) for each in leaders]) / total
+    modes = [each.believed(float(mass)) for each, mass in zip(leaders, share, strict=True)]
     best = modes[0]
-    if matched.best != 0:
-        fine = _refine(matched, gaussian, matched.best)
-        best = BelievedMode(int(found.plane[matched.best]), fine.pose[0], float(fine.log_l[0]), float(fine.distance2[0]),
-                            float(atoms.mass[_nearest(atoms, int(found.plane[matched.best]), fine.pose[0, :2])]) / total,
-                            fine)  # fmt: skip
-    elsewhere = off_map(matched)
+    if matched.best != 0:  # a feature's
+        aligned = _refined(matched, gaussian, np.array([matched.best]))[0]
+        nearest = _nearest(atoms, aligned.plane, aligned.fine.pose[0, :2])
+        best = aligned.believed(float(atoms.mass[nearest]) / total)
+    elsewhere = off_map(matched, peak)
     nowhere, poor = elsewhere.mass / (elsewhere.mass + total), _poorly_measured(matched, relative)
     atoms.mass = atoms.mass / total
     return Belief(
@@ -87,11 +95,82 @@ def believe(matched: Matched) -> Belief:
         modes=tuple(sorted(modes, key=lambda mode: -mode.probability)),
         best=best,
         lattice_mass=relative / relative.sum(),
+        log_ratio=_log_ratio(optima, matched.options.mlr_min_distance_m),
         unmapped=nowhere + (1.0 - nowhere) * poor,
         off_map_distance2=elsewhere.distance2,
         off_map_scalars=elsewhere.scalars,
-        missed=_missed(matched, total),
+        missed=_missed(matched),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Optimum:
+    plane: int
+    fine: Refined
+    objective: float  # height and course prior counted in, as the candidates' scores have them
+
+    def believed(self, probability: float) -> BelievedMode:
+        fine = self.fine
+        return BelievedMode(self.plane, fine.pose[0], float(fine.log_l[0]), float(fine.distance2[0]), probability, fine)
+
+
+def _optima(matched: Matched, gaussian: PoseGaussian) -> list[_Optimum]:
+    """Local optima of the posterior, the best first: refined from the best candidates of every place and heading."""
+    starts = distinct_poses(
+        matched.candidates.plane, matched.position_m, matched.courses.heading_rad[matched.candidates.course],
+        START_APART_M, START_APART_RAD, _STARTS,
+    )  # fmt: skip
+    kept: list[_Optimum] = []
+    for each in sorted(_refined(matched, gaussian, starts), key=lambda each: -each.objective):
+        pose = each.fine.pose[0]
+        again = any(
+            each.plane == other.plane
+            and np.linalg.norm(pose[:2] - other.fine.pose[0, :2]) < _SAME_M
+            and abs(np.angle(np.exp(1j * (pose[2] - other.fine.pose[0, 2])))) < _SAME_RAD
+            for other in kept
+        )
+        if not again:
+            kept.append(each)
+    return kept
+
+
+def _refined(matched: Matched, gaussian: PoseGaussian, candidates: NDArray[np.int64]) -> list[_Optimum]:
+    """Candidates, refined; those of a plane together."""
+    found, courses = matched.candidates, matched.courses
+    refined = []
+    for k, plane in enumerate(matched.planes):
+        here = candidates[found.plane[candidates] == k]
+        if not len(here):
+            continue
+        course = found.course[here]
+        start = np.column_stack([
+            matched.position_m[here], courses.heading_rad[course], courses.scale[course] - 1.0,
+            courses.drift_rad_per_m[course],
+        ])  # fmt: skip
+        floor = matched.floors[matched.plane_floor[k]]
+        fine = refine_poses(floor, plane, matched.window, start, gaussian, matched.error)
+        height = _height_log(matched, k)
+        refined += [_Optimum(k, fine.only(m), float(fine.objective[m]) + height) for m in range(len(here))]
+    return refined
+
+
+def _leaders(optima: list[_Optimum]) -> list[_Optimum]:
+    """The best optimum of every place, places MODES_APART_M apart; the best first."""
+    leaders: list[_Optimum] = []
+    for each in optima:
+        if len(leaders) < _MODES and not any(_near(each, other, MODES_APART_M) for other in leaders):
+            leaders.append(each)
+    return leaders
+
+
+def _near(a: _Optimum, b: _Optimum, distance_m: float) -> bool:
+    return a.plane == b.plane and bool(np.linalg.norm(a.fine.pose[0, :2] - b.fine.pose[0, :2]) < distance_m)
+
+
+def _log_ratio(optima: list[_Optimum], apart_m: float) -> float | None:
+    """Log ratio of the best optimum and the best one elsewhere (Shockley 8.2); None where nothing was found elsewhere."""
+    rivals = [each.objective for each in optima if not _near(each, optima[0], apart_m)]
+    return optima[0].objective - max(rivals) if rivals else None
 
 
 def _nearest(atoms: Atoms, plane: int, position_m: Array) -> int:
@@ -99,11 +178,11 @@ def _nearest(atoms: Atoms, plane: int, position_m: Array) -> int:
     return int(np.argmin(np.where(atoms.plane == plane, distance, np.inf)))
 
 
-def _missed(matched: Matched, total: float) -> float:
+def _missed(matched: Matched) -> float:
     """The share of the posterior the search left out, at most, as it is searched: with inflated variances."""
     scores = matched.candidates.score[np.isfinite(matched.candidates.score)]
-    searched = np.exp(scores - scores.max())
-    return matched.candidates.missed_mass / (matched.candidates.missed_mass + float(searched.sum()))
+    searched = float(np.exp(scores - scores.max()).sum())
+    return matched.candidates.missed_mass / (matched.candidates.missed_mass + searched)
 
 
 def pose_gaussian(matched: Matched) -> PoseGaussian:
@@ -124,28 +203,18 @@ def pose_gaussian(matched: Matched) -> PoseGaussian:
     return PoseGaussian(mean, precision, free)
 
 
-def _refine(matched: Matched, gaussian: PoseGaussian, candidate: int) -> Refined:
-    found, courses, plane = matched.candidates, matched.courses, int(matched.candidates.plane[candidate])
-    k = int(found.course[candidate])
-    course = courses.heading_rad[k], courses.scale[k] - 1.0, courses.drift_rad_per_m[k]
-    start = np.array([[*matched.position_m[candidate], *course]])
-    floor = matched.floors[matched.plane_floor[plane]]
-    return refine_poses(floor, matched.planes[plane], matched.window, start, gaussian, matched.error)
+def _laplace_mass(matched: Matched, gaussian: PoseGaussian, optimum: _Optimum, peak: float) -> float:
+    """The optimum's mass in units of exp(peak) per pose, as if the lattice were infinitely fine.
 
-
-def _laplace_mass(matched: Matched, gaussian: PoseGaussian, plane: int, refined: Refined) -> float:
-    """The mode's mass in units of the best pose of the lattice, as if the lattice were infinitely fine.
-
-    A heading of the lattice weighs exp(log prior), a scale or a drift what its prior holds: their priors have a constant.
+    A heading of the lattice weighs exp(log prior), a scale or a drift what its prior holds: theirs have a constant.
     """
     free = gaussian.free.astype(bool)
-    covariance = refined.covariance[0][np.ix_(free, free)]
+    covariance = optimum.fine.covariance[0][np.ix_(free, free)]
     step = matched.courses.steps.heading_rad if free[2] else 1.0
-    volume = matched.planes[plane].resolution_m ** 2 * step
+    volume = matched.planes[optimum.plane].resolution_m ** 2 * step
     told = float(np.sum(np.log(2.0 * np.pi / gaussian.precision[3:][free[3:]])))
     log_volume = 0.5 * float(np.linalg.slogdet(2 * np.pi * covariance)[1]) - 0.5 * told - np.log(volume)
-    peak = refined.objective[0] - matched.score[0] + _height_log(matched, plane) + log_volume
-    return float(np.exp(np.clip(peak, -700, 700)))
+    return float(np.exp(np.clip(optimum.objective - peak + log_volume, -700, 700)))
 
 
 def _height_log(matched: Matched, plane: int) -> float:
@@ -155,7 +224,7 @@ def _height_log(matched: Matched, plane: int) -> float:
     return float(-0.5 * ((matched.planes[plane].height_m - prior.position_m[2]) / prior.sd_m) ** 2)
 
 
-def _mode_masses(atoms: Atoms, centres: list[tuple[int, Array]], reach_m: float) -> Array:
+def _mode_masses(atoms: Atoms, centres: list[tuple[int, Array]]) -> Array:
     """Mass of each mode (m,): every atom within reach goes to the nearest centre on its plane."""
     if not centres:
         return np.zeros(0)
@@ -164,7 +233,7 @@ def _mode_masses(atoms: Atoms, centres: list[tuple[int, Array]], reach_m: float)
         here = atoms.plane == plane
         distance[k, here] = np.linalg.norm(atoms.position_m[here] - centre, axis=1)
     nearest = np.argmin(distance, axis=0)
-    near = distance[nearest, np.arange(len(nearest))] < reach_m
+    near = distance[nearest, np.arange(len(nearest))] < MODES_APART_M
     return np.asarray(np.bincount(nearest[near], weights=atoms.mass[near], minlength=len(centres)), dtype=np.float64)
 
 

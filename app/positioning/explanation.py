@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.positioning.belief import Belief, BelievedMode
@@ -87,20 +86,17 @@ def _surface(matched: Matched, plane_index: int) -> LikelihoodSurface:
     np.maximum.at(surface, (found.row[here] // stride, found.column[here] // stride), matched.score[here])
     origin = tuple(o + plane.resolution_m * (stride - 1) / 2.0 for o in plane.origin_m)
     return LikelihoodSurface(
-        matched.floors[matched.plane_floor[plane_index]].floor_id, plane.height_m, (origin[0], origin[1]),
+        matched.floor_id(plane_index), plane.height_m, (origin[0], origin[1]),
         plane.resolution_m * stride, surface - matched.score[0],
     )  # fmt: skip
 
 
 def _place(matched: Matched, mode: BelievedMode) -> ExplainedPlace:
     plane, fine = matched.planes[mode.plane], mode.refined
-    half_m = 0.5 * float(matched.window.path_m[-1] - matched.window.path_m[0])
-    turn = matched.device_turn_rad
-    heading = None if turn is None else float(np.angle(np.exp(1j * (mode.pose[2] + mode.pose[4] * half_m + turn))))
     return ExplainedPlace(
-        floor_id=matched.floors[matched.plane_floor[mode.plane]].floor_id,
-        position_m=(float(mode.pose[0]), float(mode.pose[1]), plane.height_m),
-        heading_rad=heading,
+        floor_id=matched.floor_id(mode.plane),
+        position_m=matched.place(mode.plane, mode.pose),
+        heading_rad=matched.device_heading_rad(mode.pose),
         probability=mode.probability,
         log_likelihood=mode.log_l + len(matched.window) * float(np.log(plane.scale).sum()),
         bias_uT=fine.bias_uT[0] / plane.scale,

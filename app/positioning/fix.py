@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["AblEstimate", "Fix", "LocateOptions", "MlEstimate", "MlrEstimate", "Mode", "Posterior", "Prior", "Status"]
+__all__ = [
+    "AblEstimate", "ContourEstimate", "Fix", "LocateOptions", "MadEstimate", "MlEstimate", "MlrEstimate", "Mode",
+    "Posterior", "Prior", "Status",
+]  # fmt: skip
 
 Status = Literal["fix", "ambiguous", "inconsistent", "unmapped"]
 
@@ -34,7 +37,7 @@ class LocateOptions:
     feature_rms_uT: float | None = (
         None  # a feature whose best match is worse than this is unknown; None: the gate judges
     )
-    bias_sd_uT: float = 1.0
+    bias_sd_uT: float = 0.5
     step_scale_sd: float = 0.05
     heading_drift_sd_rad_per_m: float = 0.003
     walkable: Callable[[str, Array, Array], NDArray[np.bool_]] | None = None
@@ -82,6 +85,32 @@ class AblEstimate:
 
     available: bool
     bin_probability: float | None = None
+    peak_over_uniform: float | None = None
+    floor_id: str | None = None
+    position_m: tuple[float, float, float] | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MadEstimate:
+    """Least mean absolute deviation of norms (Cuenca 1.10), among the likely poses.
+
+    `ratio`: deviation of the best place elsewhere over that of the best: near one, two places fit alike."""
+
+    available: bool
+    mad_uT: float | None = None
+    ratio: float | None = None
+    floor_id: str | None = None
+    position_m: tuple[float, float, float] | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ContourEstimate:
+    """The nearest place to the MAD estimate on the contour of the last reading's norm (Cuenca 1.11), `moved_m` off."""
+
+    available: bool
+    moved_m: float | None = None
     floor_id: str | None = None
     position_m: tuple[float, float, float] | None = None
     reason: str | None = None
@@ -129,4 +158,6 @@ class Fix:
     ml: MlEstimate | None
     mlr: MlrEstimate
     abl: AblEstimate
+    mad: MadEstimate
+    contour: ContourEstimate
     posterior: Posterior | None

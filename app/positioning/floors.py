@@ -18,6 +18,7 @@ __all__ = [
 ]  # fmt: skip
 
 TOP_LEVEL = 5  # the search starts from blocks of 2^5 cells
+CELL_SHARE = 0.25  # of the squared change from cell to cell: places are rounded twice, by up to half a cell per axis
 Float32 = NDArray[np.float32]
 
 
@@ -27,8 +28,8 @@ class Plane:
 
     mean_uT                (ny + 2, nx + 2, c) features of the field times `scale`, one cell of prior on each side;
                            unmeasured cells hold the prior
-    variance_uT2           (ny + 2, nx + 2) variance of one measurement about them (map sd and the floor's noise
-                           together): one figure for all components, which `scale` makes alike
+    variance_uT2           (ny + 2, nx + 2) variance of one measurement about them: map sd, the floor's noise, and what
+                           the field varies within a cell; one figure for all components, which `scale` makes alike
     measured               (ny, nx)
     scale                  (c,) factor of each component: the horizontal ones keep their microteslas, the vertical is
                            stretched to their noise
@@ -131,8 +132,9 @@ def _plane(grid: FieldGrid, layer: int, components: Components, noise_sd_uT: Arr
     ambient = scale * reduce_field(grid.ambient_uT, source, components)
     off_map = float(_alike(reduce_variance(grid.ambient_uT, np.square(grid.prior_sd_uT) + noise, source, components),
                            scale))  # fmt: skip
-    features = _padded(scale * reduce_field(mean, source, components), ambient)
-    spread = _padded(variance, off_map)
+    cells = scale * reduce_field(mean, source, components)
+    features = _padded(cells, ambient)
+    spread = _padded(variance + CELL_SHARE * _change_of_a_cell_uT2(cells), off_map)
     known = variance[measured]
     return Plane(
         height_m=float(grid.heights_m[layer]),
@@ -148,6 +150,15 @@ def _plane(grid: FieldGrid, layer: int, components: Components, noise_sd_uT: Arr
         gradient_uT_per_m=_rms_gradient(grid, layer),
         pyramid=build_pyramid(features, spread, TOP_LEVEL),
     )
+
+
+def _change_of_a_cell_uT2(cells: Array) -> Array:
+    """(ny, nx) mean square over components of the change from a cell to the next, both axes together."""
+    change = np.zeros(cells.shape[:2])
+    for axis in (0, 1):
+        if cells.shape[axis] > 1:
+            change += np.mean(np.square(np.gradient(cells, axis=axis)), axis=-1)
+    return change
 
 
 def feature_scale(noise_uT2: Array, components: Components) -> Array:

@@ -18,7 +18,8 @@ from app.positioning.features import window_features
 from app.positioning.window import Window, course_yaw_rad
 
 __all__ = [
-    "Courses", "ReducedWindow", "Steps", "Turned", "bent_m", "course_lattice", "heading_lattice", "reduce_window", "single_course",
+    "Courses", "ReducedWindow", "Steps", "Turned", "bent_m", "course_lattice", "heading_lattice",
+    "lattice_noise_uT2", "reduce_window", "single_course",
     "turn_window", "widest_steps",
 ]  # fmt: skip
 
@@ -69,7 +70,7 @@ class Courses:
     scale                 true over told displacements
     drift_rad_per_m       heading gained per metre walked, beyond what was told
     log_prior             log weight: over scales and drifts it sums to one; the heading's is a density up to a constant
-    steps                 distance between neighbouring values
+    steps                 distance between neighbouring values; of one value alone what is as uncertain: sqrt(12) sds
     """
 
     heading_rad: Array
@@ -138,24 +139,49 @@ def reduce_window(
 
 
 def widest_steps(window: ReducedWindow, gradient_uT_per_m: float, variance_uT2: Array, offset: float | None) -> Steps:
-    """Steps at which a course midway between two of the lattice loses at most `_LOSS_NATS`, given the error's variances (n,).
+    """Steps at which a course midway between two of the lattice loses `_LOSS_NATS` at most, given errors' variances (n,).
 
     What turning and stretching the window change follows from the rms gradient of the map and the levers of the samples
     about their middle, since a pose is free to move; what an offset of precision `offset` explains does not count.
     """
     weight = 1.0 / variance_uT2
+    turned, along = _turning_uT(window)
+    changes = _changes_uT2(window, gradient_uT_per_m)
+    heading, scale, drift = (float(weight @ change) for change in changes)
+    heading += _explained(turned, weight, offset)
+    drift += _explained(turned * along[:, None], weight, offset)
+    return Steps(*(float(2.0 * np.sqrt(2.0 * _LOSS_NATS / max(x, 1e-12))) for x in (heading, scale, drift)))
+
+
+def lattice_noise_uT2(window: ReducedWindow, gradient_uT_per_m: float, steps: Steps) -> Array:
+    """(n,) variance per component of what lies between the courses of a lattice, evenly spread over its steps.
+
+    The search scores with it, so that the true course is not lost between two of the lattice.
+    """
+    turned, along = _turning_uT(window)
+    heading, scale, drift = _changes_uT2(window, gradient_uT_per_m)
+    turning = np.sum(np.square(turned), axis=1)
+    total = (heading + turning) * steps.heading_rad**2 + scale * steps.scale**2
+    total = total + (drift + turning * np.square(along)) * steps.drift_rad_per_m**2
+    return np.asarray(total / (12.0 * window.features_uT.shape[1]))
+
+
+def _changes_uT2(window: ReducedWindow, gradient_uT_per_m: float) -> tuple[Array, Array, Array]:
+    """(n,) expected squared change of the field a sample meets, per squared heading, scale and drift."""
     across = 0.5 * gradient_uT_per_m**2
     centred = window.from_last_m - window.from_last_m.mean(axis=0)
-    along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
-    lever2 = np.sum(np.square(centred), axis=1)
+    lever2 = across * np.sum(np.square(centred), axis=1)
     _, sideways = bent_m(window, np.zeros(1))
-    heading, drift = float(across * weight @ lever2), float(across * weight @ np.sum(np.square(sideways), axis=1))
-    if window.turns:
-        turned = np.column_stack([-window.features_uT[:, 1], window.features_uT[:, 0]])
-        heading += _explained(turned, weight, offset)
-        drift += _explained(turned * along[:, None], weight, offset)
-    scale = float(across * weight @ lever2)
-    return Steps(*(float(2.0 * np.sqrt(2.0 * _LOSS_NATS / max(x, 1e-12))) for x in (heading, scale, drift)))
+    sideways = sideways - sideways.mean(axis=0)
+    return lever2, lever2, across * np.sum(np.square(sideways), axis=1)
+
+
+def _turning_uT(window: ReducedWindow) -> tuple[Array, Array]:
+    """Change of the features' horizontal part with the heading (n, 2), uT/rad, and distance from mid-path (n,), m."""
+    along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
+    if not window.turns:
+        return np.zeros((len(window), 2)), along
+    return np.column_stack([-window.features_uT[:, 1], window.features_uT[:, 0]]), along
 
 
 def heading_lattice(window: Window, step_rad: float) -> Array:
@@ -196,7 +222,7 @@ def course_lattice(window: Window, steps: Steps, scale_sd: float, drift_sd_rad_p
     drift, drift_log, drift_step = _nodes(turning_sd, steps.drift_rad_per_m, MAX_DRIFTS)
     h, s, d = (a.ravel() for a in np.meshgrid(np.arange(len(heading)), np.arange(len(scale)), np.arange(len(drift)),
                                               indexing="ij"))  # fmt: skip
-    heading_step = float(abs(heading[1] - heading[0])) if len(heading) > 1 else 1.0
+    heading_step = float(abs(heading[1] - heading[0])) if len(heading) > 1 else 0.0
     return Courses(
         heading[h], 1.0 + scale[s], drift[d], heading_log[h] + scale_log[s] + drift_log[d],
         Steps(heading_step, scale_step, drift_step),
@@ -206,8 +232,8 @@ def course_lattice(window: Window, steps: Steps, scale_sd: float, drift_sd_rad_p
 def single_course(heading_rad: Array) -> Courses:
     """Headings (h,) alone, all alike: displacements as told."""
     h = len(heading_rad)
-    step = float(abs(heading_rad[1] - heading_rad[0])) if h > 1 else 1.0
-    return Courses(np.asarray(heading_rad), np.ones(h), np.zeros(h), np.zeros(h), Steps(step, 1.0, 1.0))
+    step = float(abs(heading_rad[1] - heading_rad[0])) if h > 1 else 0.0
+    return Courses(np.asarray(heading_rad), np.ones(h), np.zeros(h), np.zeros(h), Steps(step, 0.0, 0.0))
 
 
 def turn_window(window: ReducedWindow, courses: Courses, resolution_m: float) -> Turned:
@@ -260,7 +286,7 @@ def _nodes(sd: float, step: float, most: int) -> tuple[Array, Array, float]:
     """Values about zero within the prior, their log weights (summing to one), and their spacing."""
     reach = _NUISANCE_PRIOR_SDS * sd
     if reach <= 0.5 * step:
-        return np.zeros(1), np.zeros(1), 1.0
+        return np.zeros(1), np.zeros(1), float(np.sqrt(12.0) * sd)
     sides = min(int(np.ceil(reach / step - 0.5)), most // 2)
     value = np.linspace(-sides, sides, 2 * sides + 1) * (reach / (sides + 0.5))
     half = reach / (2 * sides + 1)

@@ -13,7 +13,7 @@ from app.field.grid import FieldGrid
 from app.positioning.belief import Belief, believe
 from app.positioning.explanation import Explanation, explain
 from app.positioning.features import common_components
-from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlrEstimate, Prior
+from app.positioning.fix import AblEstimate, ContourEstimate, Fix, LocateOptions, MadEstimate, MlrEstimate, Prior
 from app.positioning.floors import SearchableFloor, prepare_floor, prepare_floors, reduce_floor, shared_noise_sd_uT
 from app.positioning.matching import Matched, match
 from app.positioning.verdict import conclude
@@ -78,8 +78,10 @@ def _answer(
     _check_options(prior, options)
     if not floors:
         nothing = "none of the floors asked for has a map to search; upload surveys and build one"
-        unavailable = MlrEstimate(False, None, reason=nothing), AblEstimate(False, reason=nothing)
-        return Fix("unmapped", nothing, None, *unavailable, None), None
+        return Fix(
+            "unmapped", nothing, None, MlrEstimate(False, None, reason=nothing), AblEstimate(False, reason=nothing),
+            MadEstimate(False, reason=nothing), ContourEstimate(False, reason=nothing), None,
+        ), None  # fmt: skip
     shared = common_components(window.frame, {floor.floor_id: floor.components for floor in floors})
     noise_sd_uT = shared_noise_sd_uT([floor.grid for floor in floors])
     ready = [reduce_floor(floor, shared, noise_sd_uT) for floor in floors]

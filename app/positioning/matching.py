@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from app.errors import Fault, InvalidInput
 from app.field.error_structure import strictest
 from app.field.samples import Components
-from app.geometry import Array
+from app.geometry import Array, wrap_angle_rad
 from app.positioning.feature_matching import feature_candidates, find_feature, with_aligned
 from app.positioning.fix import LocateOptions, Prior
 from app.positioning.floors import Plane, SearchableFloor
@@ -18,6 +18,7 @@ from app.positioning.lattice import (
     ReducedWindow,
     Turned,
     course_lattice,
+    lattice_noise_uT2,
     reduce_window,
     turn_window,
     widest_steps,
@@ -70,6 +71,20 @@ class Matched:
     pose_prior: PosePrior
     prior_mass: float
 
+    def floor_id(self, plane: int) -> str:
+        return self.floors[int(self.plane_floor[plane])].floor_id
+
+    def place(self, plane: int, position_m: Array) -> tuple[float, float, float]:
+        """A position (x, y, ...) on a plane in three dimensions."""
+        return float(position_m[0]), float(position_m[1]), self.planes[plane].height_m
+
+    def device_heading_rad(self, pose: Array) -> float | None:
+        """Yaw of the device at the last sample, from a refined pose; None for a building window."""
+        if self.device_turn_rad is None:
+            return None
+        half_m = 0.5 * float(self.window.path_m[-1] - self.window.path_m[0])
+        return float(wrap_angle_rad(pose[2] + pose[4] * half_m + self.device_turn_rad))
+
 
 def match(
     window: Window,
@@ -91,16 +106,18 @@ def match(
         feature = find_feature(reduced, float(np.sqrt(typical)))
         reduced = feature.section
     error = window_error(reduced.path_m, reduced.noise_variance_uT2, typical, structure, bias_sd_uT)
-    least = min(float(plane.pyramid.ladder_uT2[0]) for plane in planes)
-    variance = error.inflation * (error.own_share * least + reduced.noise_variance_uT2)
+    searched = float(np.min([np.median(plane.variance_uT2) for plane in planes]))
+    variance = error.inflation * (error.own_share * searched + reduced.noise_variance_uT2)
     steepest = max(plane.gradient_uT_per_m for plane in planes)
     steps = widest_steps(reduced, steepest, variance, error.offset_precision)
     courses = course_lattice(window, steps, options.step_scale_sd, options.heading_drift_sd_rad_per_m)
+    between = lattice_noise_uT2(reduced, steepest, courses.steps)
+    on_lattice = replace(reduced, noise_variance_uT2=reduced.noise_variance_uT2 + between)
     pose_prior = PosePrior(
         prior.position_m if prior else None, prior.sd_m if prior else 1.0, _walkable(floors, options)
     )
     kept = max(_KEPT_NATS, float(np.log(options.mlr_ratio)) + 1.0)
-    found = search(planes, reduced, courses, pose_prior, error, window_nats=kept, out_of_time=options.out_of_time)
+    found = search(planes, on_lattice, courses, pose_prior, error, window_nats=kept, out_of_time=options.out_of_time)
     aligned = np.ones(len(found.plane), dtype=np.bool_)
     if feature is not None:
         found, aligned = with_aligned(found, feature_candidates(feature, planes, courses))
@@ -110,7 +127,7 @@ def match(
         error = replace(
             error, whiten=differenced(len(reduced)) @ np.eye(len(reduced)), log_det=0.0, offset_precision=None
         )
-    score, distance2 = _scored(planes, reduced, turned, found, error)
+    score, distance2 = _scored(planes, on_lattice, turned, found, error)
     position = _positions(planes, found)
     score = score + _log_prior(planes, found, courses, position, pose_prior)
     order = np.argsort(-score, kind="stable")

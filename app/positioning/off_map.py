@@ -54,8 +54,8 @@ class OffMap:
     scalars: float
 
 
-def off_map(matched: Matched) -> OffMap:
-    """Weigh the hypothesis against the candidates: prior odds times the ratio of evidences."""
+def off_map(matched: Matched, peak: float) -> OffMap:
+    """Weigh the hypothesis against the candidates: prior odds times the ratio of evidences, in units of exp(peak)."""
     best = int(matched.candidates.plane[0])
     plane, window, error = matched.planes[best], matched.window, matched.error
     floor = matched.floors[matched.plane_floor[best]]
@@ -71,7 +71,7 @@ def off_map(matched: Matched) -> OffMap:
     prior = process_prior(plane, variance)
     fit = process_evidence(residual, window.from_last_m, correlated, prior, error.offset_precision)
     log_heading = _heading_log(matched, headings.heading_rad)
-    relative = np.exp(np.clip(fit.log_l - matched.score[0], -600, 600))
+    relative = np.exp(np.clip(fit.log_l - peak, -600, 600))
     weight = np.exp(log_heading)
     odds = OFF_MAP_PRIOR / (1.0 - OFF_MAP_PRIOR)
     return OffMap(

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from app.geometry import Array
 
 __all__ = [
-    "DISPLACEMENT_SD_M", "POSITION_SD_FLOOR_M", "Atoms", "cell_atoms", "find_modes", "mass_radius",
-    "mixture_points", "replace_narrow_mode", "untold_variance_m2",
+    "DISPLACEMENT_SD_M", "POSITION_SD_FLOOR_M", "Atoms", "NarrowMode", "cell_atoms", "distinct_poses", "mass_radius",
+    "mixture_points", "replace_narrow_modes", "untold_variance_m2",
 ]  # fmt: skip
 
 POSITION_SD_FLOOR_M = 0.03  # of the map's coordinates
@@ -38,6 +38,21 @@ class Atoms:
         return Atoms(self.plane[chosen], self.position_m[chosen], self.mass[chosen], self.covariance_m2[chosen])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class NarrowMode:
+    """A refined mode: its Gaussian on a plane of cells `cell_m`, and its Laplace mass."""
+
+    plane: int
+    position_m: Array
+    covariance_m2: Array
+    mass: float
+    cell_m: float
+
+    @property
+    def widest_m(self) -> float:
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
+
+
 def untold_variance_m2(path_m: Array) -> float:
     """Variance per axis of the last position that matching leaves, from the distances walked (n,).
 
@@ -47,48 +62,38 @@ def untold_variance_m2(path_m: Array) -> float:
     return POSITION_SD_FLOOR_M**2 + _LEFT_AT_THE_END * DISPLACEMENT_SD_M**2 * length_m
 
 
-def find_modes(
-    plane: NDArray[np.int64], position_m: Array, score: Array, separation_m: float, limit: int
-) -> list[NDArray[np.int64]]:
-    """Non-maximum suppression: modes by descending peak, each the indices of poses within `separation_m` of it."""
-    left = np.ones(len(score), dtype=bool)
-    order = np.argsort(-score, kind="stable")
-    modes: list[NDArray[np.int64]] = []
-    for peak in order:
-        if not left[peak]:
-            continue
+def distinct_poses(
+    plane: NDArray[np.int64], position_m: Array, heading_rad: Array, apart_m: float, apart_rad: float, limit: int
+) -> NDArray[np.int64]:
+    """Non-maximum suppression: indices of poses, which come best first, none like a better one in place and heading."""
+    left = np.ones(len(plane), dtype=bool)
+    chosen: list[int] = []
+    while len(chosen) < limit and left.any():
+        peak = int(np.argmax(left))
+        chosen.append(peak)
         near = left & (plane == plane[peak])
-        near[near] = np.linalg.norm(position_m[near] - position_m[peak], axis=1) < separation_m
-        members = order[near[order]]
-        modes.append(members)
-        left[members] = False
-        if len(modes) == limit:
-            break
-    return modes
+        near[near] = np.linalg.norm(position_m[near] - position_m[peak], axis=1) < apart_m
+        near[near] = np.abs(np.angle(np.exp(1j * (heading_rad[near] - heading_rad[peak])))) < apart_rad
+        left[near] = False
+        left[peak] = False
+    return np.array(chosen)
 
 
-def replace_narrow_mode(
-    atoms: Atoms,
-    plane: int,
-    position_m: Array,
-    covariance_m2: Array,
-    laplace_mass: float,
-    cell_m: float,
-    untold_m2: float,
-) -> Atoms:
-    """Exchange the atoms around a mode narrower than a cell for its Gaussian; wider modes stay as they are."""
-    widest = float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]))
-    if widest >= cell_m:
+def replace_narrow_modes(atoms: Atoms, modes: Sequence[NarrowMode], untold_m2: float) -> Atoms:
+    """Exchange the atoms around modes narrower than a cell for their Gaussians; wider modes stay as they are."""
+    narrow = [mode for mode in modes if mode.widest_m < mode.cell_m]
+    if not narrow:
         return atoms
-    near = (atoms.plane == plane) & (
-        np.linalg.norm(atoms.position_m - position_m, axis=1) < 3.0 * widest + 1.5 * cell_m
-    )
+    near = np.zeros(len(atoms.mass), dtype=np.bool_)
+    for mode in narrow:
+        reach_m = 3.0 * mode.widest_m + 1.5 * mode.cell_m
+        near |= (atoms.plane == mode.plane) & (np.linalg.norm(atoms.position_m - mode.position_m, axis=1) < reach_m)
     kept = atoms.on(~near)
     return Atoms(
-        np.append(kept.plane, plane),
-        np.vstack([kept.position_m, position_m]),
-        np.append(kept.mass, laplace_mass),
-        np.concatenate([kept.covariance_m2, (covariance_m2 + untold_m2 * np.eye(2))[None]]),
+        np.append(kept.plane, [mode.plane for mode in narrow]),
+        np.vstack([kept.position_m, *(mode.position_m for mode in narrow)]),
+        np.append(kept.mass, [mode.mass for mode in narrow]),
+        np.concatenate([kept.covariance_m2, *((mode.covariance_m2 + untold_m2 * np.eye(2))[None] for mode in narrow)]),
     )
 
 

@@ -58,6 +58,10 @@ class Refined:
     variance_uT2: Array
     bias_uT: Array
 
+    def only(self, k: int) -> "Refined":
+        """One of the poses."""
+        return Refined(*(getattr(self, name)[k : k + 1] for name in self.__slots__))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linearised:
@@ -158,7 +162,6 @@ def _residuals(
     east, north = stretch * told_x, stretch * told_y
     x, y = pose[:, :1] + east, pose[:, 1:2] + north
     values = grid.at(np.stack([x.ravel(), y.ravel(), np.full(x.size, plane.height_m)], axis=1))
-    shape = (*x.shape, -1)
     total = values.sd_uT**2 + floor.noise_sd_uT**2
     variance = np.mean(np.square(plane.scale) * reduce_variance(values.mean_uT, total, source, target), axis=-1)
     variance = np.maximum(variance, 1e-6).reshape(x.shape)

@@ -4,90 +4,54 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from app.geometry import Array, wrap_angle_rad
+from app.geometry import Array
 from app.positioning.ambiguity import FARTHEST_M, walk_further
-from app.positioning.belief import Belief, BelievedMode
-from app.positioning.fix import AblEstimate, Fix, LocateOptions, MlEstimate, MlrEstimate, Mode, Posterior, Status
+from app.positioning.belief import Belief
+from app.positioning.estimates import abl_estimate, contour_estimate, mad_estimate, ml_estimate, mlr_estimate
+from app.positioning.fix import (
+    AblEstimate,
+    ContourEstimate,
+    Fix,
+    LocateOptions,
+    MadEstimate,
+    MlrEstimate,
+    Mode,
+    Posterior,
+    Status,
+)
 from app.positioning.matching import Matched
 from app.positioning.misfit import misfit, residual_rms_uT
 from app.positioning.posterior import mass_radius, mixture_points
-from app.positioning.techniques import (
-    ABL_UNIFORM_MULTIPLE,
-    best_bin,
-    chi_square_limit,
-    likelihood_rival,
-    peak_over_uniform,
-)
+from app.positioning.techniques import chi_square_limit
 
 __all__ = ["conclude"]
 
 _CERTAIN = 0.8  # a fix has one mode with at least this probability, off the map and what was missed counted in
 _MISSED = 0.05  # beyond this share of missed mass a radius of 95 % cannot be stated from the rest
-Position = tuple[float, float, float]
 
 
 def conclude(matched: Matched, belief: Belief, techniques: Sequence[str], options: LocateOptions) -> Fix:
     """Estimates, posterior and status of a belief."""
     status, reason = _status(matched, belief, options)
     not_asked = "not asked for"
+    mad = MadEstimate(False, reason=not_asked)
+    contour = ContourEstimate(False, reason=not_asked)
+    if {"mad", "contour"} & set(techniques):
+        mad = mad_estimate(matched, options)
+    if "contour" in techniques:
+        contour = contour_estimate(matched, mad)
     return Fix(
         status=status,
         reason=reason,
-        ml=_ml(matched, belief),
-        mlr=_mlr(matched, belief, options) if "mlr" in techniques else MlrEstimate(False, None, reason=not_asked),
-        abl=_abl(matched, belief, options) if "abl" in techniques else AblEstimate(False, reason=not_asked),
+        ml=ml_estimate(matched, belief),
+        mlr=mlr_estimate(matched, belief, options)
+        if "mlr" in techniques
+        else MlrEstimate(False, None, reason=not_asked),
+        abl=abl_estimate(matched, belief, options) if "abl" in techniques else AblEstimate(False, reason=not_asked),
+        mad=mad,
+        contour=contour,
         posterior=_posterior(matched, belief),
     )
-
-
-def _ml(matched: Matched, belief: Belief) -> MlEstimate:
-    best = belief.best
-    unscaled = best.log_l + len(matched.window) * float(np.log(matched.window.scale).sum())
-    return MlEstimate(
-        _floor_id(matched, best.plane), _position(matched, best.plane, best.pose), _heading(matched, best), unscaled,
-        residual_rms_uT(matched, best.refined),
-    )  # fmt: skip
-
-
-def _mlr(matched: Matched, belief: Belief, options: LocateOptions) -> MlrEstimate:
-    found = matched.candidates
-    far = options.mlr_min_distance_m
-    if not _anything_beyond(matched, far):
-        return MlrEstimate(
-            False, None, reason=f"the map ends within {far:g} m of the best match: no rival to compare with"
-        )
-    rival = likelihood_rival(matched.position_m, found.plane, matched.score, 0, far)
-    log_ratio = rival.log_ratio if rival else found.window_nats
-    ratio = float(np.exp(min(log_ratio, 700.0)))
-    if not ratio > options.mlr_ratio:
-        reason = f"a place {far:g} m away or more matches nearly as well: ratio {ratio:.2f}, not {options.mlr_ratio:g}"
-        return MlrEstimate(False, ratio, reason=reason)
-    best = belief.best
-    return MlrEstimate(True, ratio, _floor_id(matched, best.plane), _position(matched, best.plane, best.pose))
-
-
-def _abl(matched: Matched, belief: Belief, options: LocateOptions) -> AblEstimate:
-    found, mass = matched.candidates, belief.lattice_mass
-    strongest, winner, lead = None, 0, -1.0
-    tables, cells = [], sum(plane.shape[0] * plane.shape[1] for plane in matched.planes)
-    for k in np.unique(found.plane):
-        here, plane = found.plane == k, matched.planes[k]
-        row0, column0 = found.row[here].min(), found.column[here].min()
-        table = np.zeros((found.row[here].max() - row0 + 1, found.column[here].max() - column0 + 1))
-        np.add.at(table, (found.row[here] - row0, found.column[here] - column0), mass[here])
-        tables.append(table.ravel())
-        held = best_bin(table, max(round(options.abl_bin_m / plane.resolution_m), 1))
-        if held.mass > lead:
-            lead, winner = held.mass, int(k)
-            strongest = (column0 + held.column, row0 + held.row)
-    threshold = ABL_UNIFORM_MULTIPLE if options.abl_threshold is None else options.abl_threshold
-    multiple = peak_over_uniform(np.concatenate(tables), cells)
-    if multiple < threshold or strongest is None:
-        reason = f"the likelihood is spread out: its peak is {multiple:.3g} times the uniform share, not {threshold:g}"
-        return AblEstimate(False, lead, reason=reason)
-    plane = matched.planes[winner]
-    x, y = (o + plane.resolution_m * k for o, k in zip(plane.origin_m, strongest, strict=True))
-    return AblEstimate(True, lead, _floor_id(matched, winner), (float(x), float(y), plane.height_m))
 
 
 def _posterior(matched: Matched, belief: Belief) -> Posterior:
@@ -113,7 +77,7 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
     return Posterior(
         floor_probability={floor_id: float(p) for floor_id, p in zip(ids, probability, strict=True)},
         floor_id=ids[strongest],
-        position_m=_position(matched, plane, centre),
+        position_m=matched.place(plane, centre),
         covariance_m2=covariance,
         radius_50_m=radii[0],
         radius_68_m=radii[1],
@@ -121,7 +85,7 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
         radius_95_m=radii[3],
         modes=tuple(
             Mode(
-                _floor_id(matched, mode.plane), _position(matched, mode.plane, mode.pose), _heading(matched, mode),
+                matched.floor_id(mode.plane), matched.place(mode.plane, mode.pose), matched.device_heading_rad(mode.pose),
                 mode.probability,
             )
             for mode in belief.modes
@@ -217,28 +181,3 @@ def _mode_mean(points_m: Array, mass: Array, peak_m: Array) -> Array:
     """Mean of the mass about a peak: within the radius that keeps the mode apart from others, itself if nothing is."""
     near = np.linalg.norm(points_m - peak_m, axis=1) < 2.0
     return np.asarray(mass[near] @ points_m[near] / mass[near].sum()) if near.any() else peak_m
-
-
-def _anything_beyond(matched: Matched, distance_m: float) -> bool:
-    best = matched.candidates.plane[0]
-    if len(matched.planes) > 1:
-        return True
-    plane = matched.planes[best]
-    extent = plane.resolution_m * (np.array(plane.shape[::-1]) - 1)
-    from_origin = matched.position_m[0] - np.array(plane.origin_m)
-    return bool(np.linalg.norm(np.maximum(from_origin, extent - from_origin)) >= distance_m)
-
-
-def _floor_id(matched: Matched, plane: int) -> str:
-    return matched.floors[int(matched.plane_floor[plane])].floor_id
-
-
-def _position(matched: Matched, plane: int, pose: Array) -> Position:
-    return float(pose[0]), float(pose[1]), matched.planes[plane].height_m
-
-
-def _heading(matched: Matched, mode: BelievedMode) -> float | None:
-    if matched.device_turn_rad is None:
-        return None
-    half_m = 0.5 * float(matched.window.path_m[-1] - matched.window.path_m[0])
-    return float(wrap_angle_rad(mode.pose[2] + mode.pose[4] * half_m + matched.device_turn_rad))

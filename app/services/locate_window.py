@@ -9,8 +9,9 @@ from sqlalchemy import Connection, Select, bindparam, select
 
 from app.db.tables import Floor, Map
 from app.errors import NotFound
+from app.positioning.explanation import Explanation
 from app.positioning.fix import Fix, LocateOptions, Prior
-from app.positioning.locate import locate
+from app.positioning.locate import locate, locate_and_explain
 from app.positioning.window import Composition, Window
 from app.services.grid_cache import GridCache
 
@@ -33,6 +34,7 @@ class LocateResult:
     fix: Fix
     map_ids: tuple[str, ...]
     search_ms: float
+    explanation: Explanation | None = None
 
 
 def active_maps(
@@ -77,9 +79,13 @@ def locate_window(
     techniques: Sequence[str],
     prior: Prior | None,
     options: LocateOptions,
+    explained: bool = False,
 ) -> LocateResult:
     """Match a window against maps. Raises InvalidWindow, IncompatibleFrames."""
     floors = cache.searchable([(each.floor_id, each.grid_sha256) for each in maps])
     start = perf_counter()
-    fix = locate(window, floors, composition=composition, techniques=techniques, prior=prior, options=options)
-    return LocateResult(fix, tuple(each.map_id for each in maps), 1e3 * (perf_counter() - start))
+    answer = locate_and_explain if explained else locate
+    found = answer(window, floors, composition=composition, techniques=techniques, prior=prior, options=options)
+    fix, explanation = found if isinstance(found, tuple) else (found, None)
+    search_ms = 1e3 * (perf_counter() - start)
+    return LocateResult(fix, tuple(each.map_id for each in maps), search_ms, explanation)

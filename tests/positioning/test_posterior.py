@@ -6,10 +6,11 @@ import pytest
 from app.positioning.posterior import (
     Atoms,
     cell_atoms,
-    find_modes,
+    distinct_poses,
     mass_radius,
     mixture_points,
-    replace_narrow_mode,
+    NarrowMode,
+    replace_narrow_modes,
     untold_variance_m2,
 )
 
@@ -48,20 +49,20 @@ def test_atoms_sum_headings_of_a_cell() -> None:
     np.testing.assert_allclose(atoms.covariance_m2[0], (0.6**2 / 12 + 0.01) * np.eye(2))
 
 
-def test_modes_are_apart_and_strongest_first() -> None:
-    position = np.array([[0.0, 0], [1, 0], [10, 0], [10.5, 0], [0, 0]])
-    plane = np.array([0, 0, 0, 0, 1])
-    modes = find_modes(plane, position, np.array([-1.0, -2, -0.5, -3, -4]), 5.0, 8)
-    assert [sorted(mode.tolist()) for mode in modes] == [[2, 3], [0, 1], [4]]
-    assert len(find_modes(plane, position, np.zeros(5), 5.0, 1)) == 1
+def test_starts_are_apart_in_place_or_heading_and_the_best_of_theirs() -> None:
+    position = np.array([[0.0, 0], [1, 0], [10, 0], [10.5, 0], [0, 0], [10.2, 0]])
+    plane, heading = np.array([0, 0, 0, 0, 1, 0]), np.array([0.0, 0.1, 0.0, 6.2, 0.0, 3.0])
+    assert distinct_poses(plane, position, heading, 2.0, 0.35, 8).tolist() == [0, 2, 4, 5]
+    assert distinct_poses(plane, position, heading, 2.0, 0.35, 2).tolist() == [0, 2]
 
 
 def test_only_modes_narrower_than_a_cell_are_replaced() -> None:
     atoms = atoms_of([[0, 0], [0.25, 0], [9, 0]], [0.4, 0.3, 0.3], 0.1)
     centre = np.array([0.1, 0.0])
-    same = replace_narrow_mode(atoms, 0, centre, 0.3**2 * np.eye(2), 5.0, 0.25, 0.0)
-    assert same is atoms
-    fine = replace_narrow_mode(atoms, 0, centre, 0.05**2 * np.eye(2), 0.9, 0.25, 0.0009)
+    wide = NarrowMode(0, centre, 0.3**2 * np.eye(2), 5.0, 0.25)
+    assert replace_narrow_modes(atoms, [wide], 0.0) is atoms
+    narrow = NarrowMode(0, centre, 0.05**2 * np.eye(2), 0.9, 0.25)
+    fine = replace_narrow_modes(atoms, [wide, narrow], 0.0009)
     np.testing.assert_allclose(fine.mass, [0.3, 0.9])
     np.testing.assert_allclose(fine.covariance_m2[1], (0.05**2 + 0.0009) * np.eye(2))
 
