@@ -17,7 +17,7 @@ import sys
 
 import numpy as np
 from shockley.compositions import AREAS, Case, Study, Technique
-from shockley.verdicts import Check, Part, Side, above, below, compare, contrast, outdo, within
+from shockley.verdicts import Check, Part, Rule, Side, above, below, compare, contrast, outdo, within
 from threadpoolctl import threadpool_limits
 
 from app.positioning.sections import Transform
@@ -50,7 +50,7 @@ def of_single_epochs(study: Study) -> list[Check]:
     every = of(CROSS, "50 Hz")
     car, others = cross["CT"] + cross["TC"], of(("TS", "ST", "SC", "CS"), "50 Hz")
     clear, rest = cross["TS"] + cross["ST"], of(("TC", "SC", "CT", "CS"), "50 Hz")
-    ladder = [("MLR", "ML"), ("ABL", "MLR")]
+    ladder: list[tuple[Technique, Technique]] = [("MLR", "ML"), ("ABL", "MLR")]
     clearer = contrast(
         study, (1, Side("MLR", clear)), (-1, Side("ML", clear)), (-1, Side("MLR", rest)), (1, Side("ML", rest))
     )
@@ -60,6 +60,14 @@ def of_single_epochs(study: Study) -> list[Check]:
             "L1152",
             [outdo(study, a, b, uncal, above()) for a, b in ladder]
             + [outdo(study, b, a, uncal, above(), measure="availability") for a, b in ladder],
+        ),
+        Check(
+            "(ours) ABL above MLR and less available, the threshold on the bin",
+            OURS,
+            [
+                outdo(study, "ABL by bin", "MLR", uncal, above()),
+                outdo(study, "MLR", "ABL by bin", uncal, above(), measure="availability"),
+            ],
         ),
         Check("same vehicle: uncalibrated slightly better", "L1161", compare(study, "", THREE, uncal, cal, above())),
         Check("same vehicle: ABL modestly better than MLR", "L1165", [outdo(study, "ABL", "MLR", uncal, above())]),
@@ -219,19 +227,17 @@ def of_anomalies(study: Study) -> list[Check]:
     def transformed(transform: Transform, calibrated: bool) -> tuple[Case, ...]:
         return of(BLOCK, transform=transform, calibrated=calibrated, anomalies=True)
 
-    gains = [("demeaned", True, below(NEGLIGIBLE)), ("differenced", True, above())]
-    gains += [("demeaned", False, above()), ("differenced", False, below(NEGLIGIBLE))]
-    words = [
-        "demeaning calibrated anomalies gains nothing (3 points)",
-        "differencing calibrated anomalies gains",
-        "demeaning uncalibrated ones gains",
-        "differencing uncalibrated ones gains nothing",
+    gains: list[tuple[str, Transform, bool, Rule]] = [
+        ("demeaning calibrated anomalies gains nothing (3 points)", "demeaned", True, below(NEGLIGIBLE)),
+        ("differencing calibrated anomalies gains", "differenced", True, above()),
+        ("demeaning uncalibrated ones gains", "demeaned", False, above()),
+        ("differencing uncalibrated ones gains nothing (3 points)", "differenced", False, below(NEGLIGIBLE)),
     ]
     return [
         Check("anomalies: RSS about as good as ML", "L1257", [outdo(study, "RSS", "ML", raw, within(SMALL))]),
         *(
-            Check(word, "L1257", compare(study, "on raw cal", ("ML",), transformed(t, cal), raw, rule))  # type: ignore[arg-type]
-            for word, (t, cal, rule) in zip(words, gains, strict=True)
+            Check(claim, "L1257", compare(study, "on raw cal", ("ML",), transformed(transform, calibrated), raw, rule))
+            for claim, transform, calibrated, rule in gains
         ),
         Check("(ours) RMS beats RSS, which favours short overlaps", OURS, [outdo(study, "RMS", "ML", raw, above())]),
     ]

@@ -157,7 +157,6 @@ def test_repeated_drives_err_as_asked(roads: Roads) -> None:
         log = drive(roads, PLAIN, rng, position_rms_m=1.5, across_sd_m=0.4)
         errors.append(np.mean(np.sum((log.recorded_m - log.true_m) ** 2, axis=1)))
         across.append(cKDTree(path_m).query(log.true_m[::25])[0])
-    # recorded positions err about the lane's middle line, which is where the vehicle truly was
     assert np.sqrt(np.mean(errors)) == pytest.approx(1.5, rel=0.15)
     assert np.sqrt(np.mean(np.square(np.concatenate(across)))) == pytest.approx(0.4, rel=0.2)
 
