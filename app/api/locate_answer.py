@@ -176,14 +176,14 @@ def show_fix(
 
 def _explained(explanation: Explanation) -> ExplanationView:
     surface = explanation.surface
-    values = np.where(np.isfinite(surface.log_likelihood), np.round(surface.log_likelihood, 3), None)
+    rounded = np.round(surface.log_likelihood, 3).tolist()
     return ExplanationView(
         likelihood=LikelihoodView(
             floor_id=surface.floor_id,
             height_m=surface.height_m,
             origin_m=list(surface.origin_m),
             resolution_m=surface.resolution_m,
-            log_likelihood=values.tolist(),
+            log_likelihood=[[value if np.isfinite(value) else None for value in row] for row in rounded],
             png=base64.b64encode(likelihood_png(explanation)).decode(),
         ),
         best=_explained_place(explanation.best),

@@ -1,4 +1,4 @@
-"""How the errors of a walk against a map hang together along it: a constant, an Ornstein-Uhlenbeck process, white noise.
+"""How errors of a walk against a map hang together along it: a constant, an Ornstein-Uhlenbeck process, white noise.
 
 A window is a short walk, so its errors have the structure that surveys showed; what a window is worth as independent
 samples follows from it.
@@ -14,9 +14,9 @@ __all__ = ["UNKNOWN_STRUCTURE", "ErrorStructure", "strictest"]
 class ErrorStructure:
     """Shares of the variance a map states for one further measurement (its own and its noise's together).
 
-    The covariance of two errors a distance d walked apart is `constant_share + walk_share exp(-d / walk_length_m)` times
-    that variance, and `white_share` more at d = 0. They need not sum to one: a map states what covers errors, tails and
-    all, and means over a quarter of a metre err less than single readings.
+    The covariance of two errors a distance d walked apart is `constant_share + walk_share exp(-d / walk_length_m)`
+    times that variance, and `white_share` more at d = 0. They need not sum to one: a map states what covers errors,
+    tails and all, and means over a quarter of a metre err less than single readings.
     """
 
     constant_share: float
@@ -36,7 +36,7 @@ UNKNOWN_STRUCTURE = ErrorStructure(0.2, 0.5, 0.3, 2.0)
 
 
 def strictest(structures: Sequence[ErrorStructure]) -> ErrorStructure:
-    """One structure for floors that are compared with each other: the largest share of every kind, the longest length."""
+    """One structure for floors that are compared: the largest share of every kind, and the longest length."""
     return ErrorStructure(
         max(each.constant_share for each in structures),
         max(each.walk_share for each in structures),

@@ -39,9 +39,9 @@ def held_out_structure(held_out: Mapping[str, HeldOut]) -> ErrorStructure:
     known = pairs >= _LEAST_PAIRS
     if not known[0] or products[0] <= 0.0 or np.count_nonzero(known) < 8:
         return UNKNOWN_STRUCTURE
-    lag_m = LAG_M * np.flatnonzero(known)[1:]
+    lag_m = np.asarray(LAG_M * np.flatnonzero(known)[1:])
     covariance = products[known] / pairs[known]
-    weight = np.sqrt(pairs[known][1:] / pairs[0])
+    weight = np.asarray(np.sqrt(pairs[known][1:] / pairs[0]))
     fits = [_fit(lag_m, covariance[1:], weight, length_m) for length_m in _LENGTHS_M]
     best = int(np.argmin([misfit for misfit, _ in fits]))
     constant, walk = (float(share) for share in fits[best][1])

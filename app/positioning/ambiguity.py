@@ -24,7 +24,7 @@ _WANTED_LOG_RATIO = float(np.log(20.0))
 
 @dataclass(frozen=True, slots=True)
 class Further:
-    """distance_m   straight ahead until the strongest place is expected to be 20 times likelier than every rival, or None
+    """distance_m   straight ahead until the strongest place is expected to be 20 times likelier than every rival, None
                  if no such distance is short enough
     rivals       how many other places there are
     apart_m      of the nearest rival on the same floor, None if there is none

@@ -168,7 +168,7 @@ def _near(a: _Optimum, b: _Optimum, distance_m: float) -> bool:
 
 
 def _log_ratio(optima: list[_Optimum], apart_m: float) -> float | None:
-    """Log ratio of the best optimum and the best one elsewhere (Shockley 8.2); None where nothing was found elsewhere."""
+    """Log ratio of the best optimum to the best one elsewhere (Shockley 8.2); None where nothing else was found."""
     rivals = [each.objective for each in optima if not _near(each, optima[0], apart_m)]
     return optima[0].objective - max(rivals) if rivals else None
 

@@ -1,4 +1,4 @@
-"""The techniques' answers from a matched window: ML, MLR, ABL (Shockley 8.1-8.3), MAD and the contour (Cuenca 1.10-1.11)."""
+"""The techniques' answers from a matched window: ML, MLR, ABL (Shockley 8.1-8.3), MAD, contour (Cuenca 1.10, 1.11)."""
 
 import numpy as np
 

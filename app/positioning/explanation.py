@@ -18,10 +18,10 @@ _MOST_CELLS_A_SIDE = 96
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LikelihoodSurface:
-    """The log-likelihood of the last sample's place on one layer of one floor, best course, relative to the best of all.
+    """The log-likelihood of the last sample's place on one layer of a floor, in its best course, less the best of all.
 
-    log_likelihood (ny, nx), cells of `resolution_m` from `origin_m` (x, y of the first): searched poses exactly, between
-    them the best of a coarser lattice
+    log_likelihood (ny, nx), cells of `resolution_m` from `origin_m` (x, y of the first): candidates as they were
+    scored, between them the best of a coarser lattice
     """
 
     floor_id: str

@@ -1,8 +1,8 @@
 """Match a magnetic feature alone: a section about an anomaly, its peak laid on the peaks of the map (Shockley 8.7).
 
 A feature is a stretch that stands out of its surroundings. The seed found features by eye; here the peak of a window is
-the sample farthest from the window's median, and its section reaches to where the deviation has halved. Peaks of the map
-are the local maxima of the field's deviation from its mean over ten metres.
+the sample farthest from the window's median, and its section reaches to where the deviation has halved. Peaks of the
+map are the local maxima of the field's deviation from its mean over ten metres.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from app.errors import Fault, InvalidWindow
-from app.geometry import Array
 from app.positioning.floors import Plane
 from app.positioning.lattice import Courses, ReducedWindow, turn_window
 from app.positioning.search import Candidates
@@ -71,7 +70,7 @@ def find_feature(window: ReducedWindow, sd_uT: float) -> Feature:
 
 
 def map_peaks(plane: Plane, least_uT: float) -> NDArray[np.int64]:
-    """(k, 2) cells (row, column) where the field stands out of its surroundings most and by `least_uT`, highest first."""
+    """(k, 2) cells (row, column) where the field stands out most of its surroundings, by `least_uT`, highest first."""
     mean = plane.mean_uT[1:-1, 1:-1].astype(np.float64)
     known = plane.measured.astype(np.float64)
     side = max(3, round(SURROUNDINGS_M / plane.resolution_m))
@@ -106,8 +105,8 @@ def feature_candidates(feature: Feature, planes: Sequence[Plane], courses: Cours
         reason = "no place of the map stands out like this window's feature; use composition raw"
         raise InvalidWindow(reason, Fault("/composition", reason))
     return Candidates(
-        plane_of, course, row, column, np.full(len(course), -np.inf), window_nats=np.inf, complete=complete, missed_mass=0.0,
-        poses=len(course),
+        plane_of, course, row, column, np.full(len(course), -np.inf), window_nats=np.inf, complete=complete,
+        missed_mass=0.0, poses=len(course),
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ class LocateOptions:
                                  map differ by
     step_scale_sd                relative sd of the scale of the window's displacements
     heading_drift_sd_rad_per_m   sd of the drift of the window's heading, per metre walked
-    walkable                     (floor id, x_m (nx,), y_m (ny,)) -> (ny, nx) where the device may be now; None: anywhere
+    walkable                     (floor id, x_m (nx,), y_m (ny,)) -> (ny, nx) where the device may be; None: anywhere
     out_of_time                  asked now and then; once it says so the search ends with what it has
     """
 

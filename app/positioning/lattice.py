@@ -43,8 +43,7 @@ class ReducedWindow:
     components             what the features are
     scale                  (c,) what the components were multiplied by
     turns                  whether a heading turns the features (vector components of a level window)
-    yaw_rad                (n,) of the sensor in the window's frame, from the first sample's; zero where features are not
-                           vectors
+    yaw_rad                (n,) of the sensor in the window's frame; zero where features are not vectors
     tilt                   (n, 3, 3) rotation from the frame's axes turned by yaw to the sensor's, or (0, 3, 3): upright
     """
 
@@ -139,7 +138,7 @@ def reduce_window(
 
 
 def widest_steps(window: ReducedWindow, gradient_uT_per_m: float, variance_uT2: Array, offset: float | None) -> Steps:
-    """Steps at which a course midway between two of the lattice loses `_LOSS_NATS` at most, given errors' variances (n,).
+    """Steps at which a course midway between two of the lattice loses `_LOSS_NATS`, with errors' variances (n,).
 
     What turning and stretching the window change follows from the rms gradient of the map and the levers of the samples
     about their middle, since a pose is free to move; what an offset of precision `offset` explains does not count.
@@ -264,8 +263,8 @@ def _placed_m(window: ReducedWindow, courses: Courses) -> Array:
 
 
 def bent_m(window: ReducedWindow, drift_rad_per_m: Array) -> tuple[Array, Array]:
-    """Positions from the last sample (h, n, 2), in the window's frame, under drifts (h,) of its heading about the middle
-    of the path (first order), and their derivative with the drift (n, 2)."""
+    """Positions from the last sample (h, n, 2), in the window's frame, under drifts (h,) of its heading about mid-path
+    (first order), and their derivative with the drift (n, 2)."""
     along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
     step = np.diff(window.from_last_m, axis=0)
     turned = np.column_stack([-step[:, 1], step[:, 0]]) * (0.5 * (along[1:] + along[:-1]))[:, None]

@@ -46,7 +46,7 @@ class Matched:
     candidates         poses of the lattice; position_m (n, 2) of the last sample
     score              (n,) log density of the window's features under the full covariance, plus log prior, best first
     distance2          (n,) its squared distance
-    best               the candidate that answers for maximum likelihood: the first, or of a feature the first whose peak
+    best               the candidate that answers for maximum likelihood: the first; of a feature the first whose peak
                        lies on one of the map's
     pose_prior         of the position
     prior_mass         of the lattice under the priors, each pose weighing exp(log prior)
@@ -226,8 +226,8 @@ def _walkable(floors: Sequence[SearchableFloor], options: LocateOptions) -> list
     for floor in floors:
         for plane in floor.planes:
             ny, nx = plane.shape
-            x = plane.origin_m[0] + plane.resolution_m * np.arange(nx)
-            y = plane.origin_m[1] + plane.resolution_m * np.arange(ny)
+            x = np.asarray(plane.origin_m[0] + plane.resolution_m * np.arange(nx))
+            y = np.asarray(plane.origin_m[1] + plane.resolution_m * np.arange(ny))
             masks.append(np.asarray(options.walkable(floor.floor_id, x, y), dtype=np.bool_))
     return masks
 

@@ -90,7 +90,7 @@ def _heading_log(matched: Matched, heading_rad: Array) -> Array:
 def process_evidence(
     residual_uT: Array, position_m: Array, error_uT2: Array, prior: ProcessPrior, offset_precision: float | None
 ) -> Evidence:
-    """Log evidence of residuals (h, n, c) about the ambient field, at positions (n, 2), with errors of covariance (n, n).
+    """Log evidence of residuals (h, n, c) about the ambient field, at positions (n, 2), errors of covariance (n, n).
 
     `log N(r; 0, K + C)` summed over components; with a precision, a constant per component is integrated out under its
     prior, flat if zero. One Cholesky factor per component serves all headings, since turning a window leaves its

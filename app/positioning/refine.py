@@ -2,8 +2,8 @@
 
 A pose is (x, y, heading, scale, drift): metres, radians, true over told displacement less one, radians per metre; the
 heading is the frame's half-way along the path. The objective is the log density of the window under the full covariance
-of its errors, the sensor's offset integrated out, plus the log prior; the field, its variance and its gradient are taken
-bilinearly from the grid. A step is kept only where it improves the objective.
+of its errors, the sensor's offset integrated out, plus the log prior; the field, its variance and its gradient are
+taken bilinearly from the grid. A step is kept only where it improves the objective.
 """
 
 from dataclasses import dataclass
@@ -149,8 +149,8 @@ def _linearise(
 def _residuals(
     floor: SearchableFloor, plane: Plane, window: ReducedWindow, pose: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Scaled residuals z - m (m, n, c), variances (m, n), minus the residuals' derivative with the pose (m, n, c, 5), and
-    cosine and sine of the sensor's yaw (m, n, 2)."""
+    """Scaled residuals z - m (m, n, c), variances (m, n), minus the residuals' derivative with the pose (m, n, c, 5),
+    and cosine and sine of the sensor's yaw (m, n, 2)."""
     grid, source, target = floor.grid, floor.grid.components, window.components
     along = window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1])
     told, sideways = bent_m(window, pose[:, 4])

@@ -85,8 +85,8 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
         radius_95_m=radii[3],
         modes=tuple(
             Mode(
-                matched.floor_id(mode.plane), matched.place(mode.plane, mode.pose), matched.device_heading_rad(mode.pose),
-                mode.probability,
+                matched.floor_id(mode.plane), matched.place(mode.plane, mode.pose),
+                matched.device_heading_rad(mode.pose), mode.probability,
             )
             for mode in belief.modes
         ),
@@ -111,14 +111,15 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
     rms_uT, most_uT = residual_rms_uT(matched, belief.best.refined), options.feature_rms_uT
     if matched.composition == "feature" and most_uT is not None and rms_uT > most_uT:
         return "inconsistent", (
-            f"no feature of the map is like this one: the best differs by {rms_uT:.1f} uT rms, not {most_uT:g}; walk on to "
-            "another, or use composition raw"
+            f"no feature of the map is like this one: the best differs by {rms_uT:.1f} uT rms, not {most_uT:g}; walk "
+            "on to another, or use composition raw"
         )
     if distance2 > limit:
+        where = misfit(matched, belief)
         return "inconsistent", (
             f"even the best match is worse than chance allows (chi-square {distance2:.1f}, limit {limit:.1f}"
-            f"{''.join('; ' + what for what in [misfit(matched, belief)] if what)}); check units, frame and calibration, "
-            "or whether the building changed since the survey; composition demeaned removes an offset"
+            f"{'; ' if where else ''}{where}); check units, frame and calibration, or whether the building changed "
+            "since the survey; composition demeaned removes an offset"
         )
     if _unweighed(matched, belief) > 0.5:
         return "ambiguous", (

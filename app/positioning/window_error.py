@@ -1,10 +1,10 @@
 """One covariance for the errors of a window: a constant offset, errors alike along the walk, white noise.
 
 At the right pose the residuals r_i = z_i - m(p_i), turned to the sensor's axes, have per component the covariance
-    C = D^1/2 R D^1/2 + s_b^2 1 1',     D = diag((w + u) V_i + noise_i),     R_ij = w' exp(-|path_i - path_j| / l), R_ii = 1,
-where V_i is the variance of one measurement about the map there, w, u and l the shares of walk and white noise and the
-length that surveys left out have shown (`ErrorStructure`; the constant share is part of s_b^2), w' the part of D that is
-walk noise, and s_b what is not known of the sensor's offset.
+    C = D^1/2 R D^1/2 + s_b^2 1 1',    D = diag((w + u) V_i + noise_i),    R_ij = w' exp(-|s_i - s_j| / l), R_ii = 1,
+where s_i is the distance walked, V_i the variance of one measurement about the map there, w, u and l the shares of walk
+and white noise and the length that surveys left out have shown (`ErrorStructure`; the constant share is part of s_b^2),
+w' the part of D that is walk noise, and s_b what is not known of the sensor's offset.
 
 The search scores with f D + s_b^2 1 1', f the largest eigenvalue of R: that covariance dominates C, so the squared
 distance of a pose under the model is never less than the one it was searched by. Poses that were found are then scored
@@ -69,8 +69,8 @@ def window_error(
     factor = cholesky(R, lower=True)
     whiten = solve_triangular(factor, np.eye(len(R)), lower=True)
     return WindowError(
-        np.ascontiguousarray(whiten), R, 2.0 * float(np.log(np.diag(factor)).sum()), float(np.linalg.eigvalsh(R)[-1]), own,
-        precision,
+        np.ascontiguousarray(whiten), R, 2.0 * float(np.log(np.diag(factor)).sum()),
+        float(np.linalg.eigvalsh(R)[-1]), own, precision,
     )  # fmt: skip
 
 
@@ -84,7 +84,7 @@ def weigh_residuals(residual: Array, variance: Array, error: WindowError) -> Fit
 
     With a flat prior the offset costs one Gaussian factor per component (Shockley 8.6, L1236).
     """
-    n, c = residual.shape[-2:]
+    c = residual.shape[-1]
     root = 1.0 / np.sqrt(variance)
     white = error.whiten @ (residual * root[..., None])
     distance2 = np.sum(np.square(white), axis=(-2, -1))

@@ -1,5 +1,6 @@
 """A window in, a position out, over HTTP: every frame, every status, every refusal."""
 
+import base64
 from collections.abc import Callable
 from typing import Any
 
@@ -164,14 +165,81 @@ def test_a_window_in_the_wrong_unit_says_which_unit_it_looks_like(
     assert answer.json()["errors"][0]["location"] == "/body/window/b_ut/0"
 
 
-@pytest.mark.parametrize("composition", ["differenced", "feature"])
-def test_what_the_contract_names_and_is_not_there_yet_says_so(
+@pytest.mark.parametrize("composition", ["demeaned", "differenced", "feature"])
+def test_every_composition_is_answered(
     service: Any, mapped_floor: str, window: Callable[..., Any], composition: str
 ) -> None:
-    body = {"window": window()[0], "composition": composition}
+    body = {"window": window()[0], "composition": composition, "techniques": ["ml", "mlr", "abl", "mad", "contour"]}
     answer = service.http.post(f"/v1/floors/{mapped_floor}/locate", json=body)
+    assert answer.status_code == 200, answer.text
+    fix, truth = answer.json(), window()[1]
+    assert set(fix["estimates"]) == {"ml", "mlr", "abl", "mad", "contour"}
+    if composition != "feature":
+        assert np.hypot(*(np.array(fix["estimates"]["ml"]["position_m"][:2]) - truth)) < 0.7, fix
+        assert np.hypot(*(np.array(fix["estimates"]["mad"]["position_m"][:2]) - truth)) < 1.0, fix
+    for estimate in fix["estimates"].values():
+        assert estimate["available"] or estimate["reason"]
+
+
+def test_a_window_without_a_feature_says_so(service: Any, mapped_floor: str, window: Callable[..., Any]) -> None:
+    body = window()[0]
+    body["b_ut"] = [body["b_ut"][0]] * len(body["b_ut"])
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body, "composition": "feature"})
     assert answer.status_code == 422
-    assert "not offered yet" in answer.json()["detail"]
+    assert "stands out" in answer.json()["errors"][0]["reason"]
+
+
+def test_an_explanation_shows_the_likelihood_and_the_residuals(
+    service: Any, mapped_floor: str, window: Callable[..., Any]
+) -> None:
+    body, truth, _ = window()
+    plain = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body}).json()
+    assert "explanation" not in plain
+    answer = service.http.post(f"/v1/floors/{mapped_floor}/locate?explain=true", json={"window": body})
+    assert answer.status_code == 200, answer.text
+    told = answer.json()["explanation"]
+    assert base64.b64decode(told["likelihood"]["png"]).startswith(b"\x89PNG")
+    surface = np.array(told["likelihood"]["log_likelihood"], dtype=float)
+    row, column = np.unravel_index(np.nanargmax(surface), surface.shape)
+    peak = np.array(told["likelihood"]["origin_m"]) + told["likelihood"]["resolution_m"] * np.array([column, row])
+    assert np.hypot(*(peak - truth)) < 1.0
+    best = told["best"]
+    assert len(best["path_m"]) == len(best["residual_ut"]) == len(best["residual_sds"])
+    assert 0.3 < np.sqrt(np.mean(np.square(best["residual_sds"]))) < 1.5
+    assert abs(best["step_scale"] - 1.0) < 0.1
+
+
+def test_what_is_known_of_the_window_can_be_told(service: Any, mapped_floor: str, window: Callable[..., Any]) -> None:
+    body, truth, _ = window()
+    x, y = truth
+    ring = [[x - 2, y - 2], [x + 2, y - 2], [x + 2, y + 2], [x - 2, y + 2], [x - 2, y - 2]]
+    options = {
+        "bias_sd_ut": 2.0, "step_scale_sd": 0.02, "heading_drift_sd_rad_per_m": 0.0, "time_budget_ms": 60_000,
+        "walkable": {"type": "Polygon", "coordinates": [ring]},
+    }  # fmt: skip
+    fix = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body, "options": options}).json()
+    assert fix["status"] == "fix", fix
+    assert np.hypot(*(np.array(fix["estimates"]["ml"]["position_m"][:2]) - truth)) < 0.5
+    elsewhere = {"walkable": {"type": "MultiPolygon", "coordinates": [[[[900, 0], [901, 0], [901, 1], [900, 0]]]]}}
+    refused = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body, "options": elsewhere})
+    assert refused.status_code == 422
+    assert "walkable" in refused.json()["detail"]
+    flat = {"walkable": {"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]}}
+    assert (
+        service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body, "options": flat}).status_code
+        == 422
+    )
+
+
+def test_a_window_indexed_by_time_needs_a_speed(service: Any, mapped_floor: str, window: Callable[..., Any]) -> None:
+    body, truth, heading = window()
+    distance = np.linalg.norm(body.pop("displacement_m"), axis=1)
+    without = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": body})
+    assert without.status_code == 422
+    assert "speed_m_s" in without.text
+    timed = body | {"t_s": (distance / 1.2).tolist(), "speed_m_s": 1.1, "heading_rad": heading, "heading_sd_rad": 0.1}
+    fix = service.http.post(f"/v1/floors/{mapped_floor}/locate", json={"window": timed}).json()
+    assert np.hypot(*(np.array(fix["estimates"]["ml"]["position_m"][:2]) - truth)) < 0.7, fix
 
 
 def test_json_without_its_content_type_says_so(service: Any, mapped_floor: str) -> None:

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from app.positioning.lattice import (
-    course_lattice,
     heading_lattice,
     reduce_window,
     single_course,
     turn_window,
-    widest_steps,
 )
 from app.positioning.matching import device_turn_rad
 from app.positioning.window import Window

@@ -220,7 +220,7 @@ def test_one_sample_is_answered_with_all_the_doubt_it_deserves(world: FieldGrid,
 
 
 def test_a_constant_field_is_ambiguous(grid_of: Callable, walk_on: Callable) -> None:
-    grid = grid_of(np.random.default_rng(1), (60, 60), field_sd_uT=0.0, sd_spread=0.0)
+    grid = grid_of(np.random.default_rng(1), (60, 60), field_sd_uT=0.0, sd_spread=0.0, map_sd_uT=0.05)
     walked = walk_on(np.random.default_rng(2), grid, length_m=4.0)
     fix = locate(walked.window, [prepare_floor("a", grid)])
     assert fix.status == "ambiguous", fix.reason

@@ -5,11 +5,11 @@ import pytest
 
 from app.positioning.posterior import (
     Atoms,
+    NarrowMode,
     cell_atoms,
     distinct_poses,
     mass_radius,
     mixture_points,
-    NarrowMode,
     replace_narrow_modes,
     untold_variance_m2,
 )

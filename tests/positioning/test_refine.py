@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from app.field.error_structure import ErrorStructure
 from app.positioning.floors import prepare_floor, reduce_floor
 from app.positioning.lattice import reduce_window
-from app.field.error_structure import ErrorStructure
 from app.positioning.refine import PoseGaussian, _linearise, refine_poses
 from app.positioning.window_error import plain_error, window_error
 
@@ -40,7 +40,7 @@ def test_gradient_is_that_of_the_objective(components: str, grid_of: Callable, w
     walked = walk_on(rng, grid, length_m=5.0, samples=12)
     window = reduce_window(walked.window, components, 0.25)
     prior = PoseGaussian(np.array([1.0, 12.0, 0.3, 0.0, 0.0]), np.array([0.1, 0.1, 2.0, 400.0, 1e4]), np.ones(5))
-    pose = np.array([[*walked.position_m, walked.yaw_rad, 0.0, 0.0]]) + [0.05, 0.05, 0.05, 0.02, 0.005]
+    pose = np.array([[*(walked.position_m + 0.05), walked.yaw_rad + 0.05, 0.02, 0.005]])
     path = window.path_m
     structure = ErrorStructure(0.1, 0.5, 0.4, 1.5)
     error = window_error(path, window.noise_variance_uT2, 1.0, structure, 1.0)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from app.field.grid import FieldGrid
 from app.field.pyramid import build_pyramid
-from app.positioning.floors import Plane, prepare_floor, reduce_floor
 from app.geometry import yaw_matrix
+from app.positioning.floors import Plane, prepare_floor, reduce_floor
 from app.positioning.lattice import (
     Courses,
     ReducedWindow,
