@@ -146,7 +146,8 @@ def _advice(matched: Matched, belief: Belief) -> str:
         return (
             f"{places} as likely{apart} and alike straight ahead for {FARTHEST_M:.0f} m: walk further and turn a corner"
         )
-    return f"{places} nearly as likely{apart}; walk further, about {further.distance_m:.0f} m straight ahead, to tell"
+    distance_m = np.ceil(further.distance_m)
+    return f"{places} nearly as likely{apart}; walk further, about {distance_m:.0f} m straight ahead, to tell"
 
 
 def _unweighed(matched: Matched, belief: Belief) -> float:
