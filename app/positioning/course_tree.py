@@ -29,6 +29,7 @@ class Tree(NamedTuple):
     place     (g, n, 3) per sample: first row and first column of the group's displacements from the middle cell, and
               the level of squares, from one, that covers a block so displaced; of a course alone: that of the block
     feature   (g, n, 2 c) lower, then upper bounds of the features, uT
+    exact     (h, n, c) features of the courses, uT
     middle    (g, 4) least and largest row, least and largest column of the middle sample from the last
     heading   (g, 2) cosine and sine of one of its headings
     cost      (g,) least -2 log prior
@@ -38,7 +39,8 @@ class Tree(NamedTuple):
     """
 
     place: Index
-    feature: Array
+    feature: NDArray[np.float32]
+    exact: Array
     middle: Index
     heading: Array
     cost: Array
@@ -94,11 +96,12 @@ def course_tree(
     alone = [size == len(courses) for size in sizes]
     groups = len(courses) + sum(size for size, single in zip(sizes, alone, strict=True) if not single)
     extent = np.empty((groups, n, 4), dtype=np.int32)
-    feature = np.empty((groups, n, 2 * c))
+    feature = np.empty((groups, n, 2 * c), dtype=np.float32)
+    exact = np.ascontiguousarray(turned.features_uT[:, order])
     middle, cost = np.empty((groups, 4), dtype=np.int32), np.empty(groups)
     leaves, first = np.ones(groups, dtype=np.int32), np.zeros(groups + 1, dtype=np.int32)
     level = np.zeros((groups, n), dtype=np.int32)
-    _leaves(offset, turned.features_uT, order, middle_sample, extent, feature, middle)
+    _leaves(offset, exact, order, middle_sample, extent, feature, middle)
     cost[: len(courses)] = -2.0 * courses.log_prior
     heading = np.empty((groups, 2))
     heading[: len(courses), 0], heading[: len(courses), 1] = np.cos(courses.heading_rad), np.sin(courses.heading_rad)
@@ -118,7 +121,7 @@ def course_tree(
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
     part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
-    return CourseTree(Tree(place, feature, middle, heading, cost, leaves, first, part), tuple(stages))
+    return CourseTree(Tree(place, feature, exact, middle, heading, cost, leaves, first, part), tuple(stages))
 
 
 def _counts(courses: Courses) -> tuple[int, int, int]:
@@ -191,7 +194,7 @@ def _nest(
 
 @numba.njit(cache=True, nogil=True)
 def _leaves(offset, features, order, m, extent, feature, middle):  # type: ignore[no-untyped-def]
-    """The courses, each alone: displacements counted from sample m, features with equal bounds."""
+    """The courses, each alone: displacements counted from sample m, features to single precision."""
     h, n, c = features.shape
     for g in range(h):
         middle[g, 0] = middle[g, 1] = offset[g, m, 0]
@@ -200,7 +203,12 @@ def _leaves(offset, features, order, m, extent, feature, middle):  # type: ignor
             extent[g, k, 0] = extent[g, k, 1] = offset[g, order[k], 0] - offset[g, m, 0]
             extent[g, k, 2] = extent[g, k, 3] = offset[g, order[k], 1] - offset[g, m, 1]
             for x in range(c):
-                feature[g, k, x] = feature[g, k, c + x] = features[g, order[k], x]
+                near = np.float32(features[g, k, x])
+                feature[g, k, x], feature[g, k, c + x] = near, near
+                if near < features[g, k, x]:
+                    feature[g, k, c + x] = np.nextafter(near, np.float32(np.inf))
+                elif near > features[g, k, x]:
+                    feature[g, k, x] = np.nextafter(near, np.float32(-np.inf))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -21,7 +21,11 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["Scene", "pose_cost", "record_of", "plain_bound", "to_sensor"]
+__all__ = ["NOTHING", "ROUNDING", "SLACK", "Scene", "plain_bounds", "pose_costs", "record_of", "to_sensor"]
+
+SLACK = 2e-6  # relative: what rounding to single precision may add to the terms of a bound
+ROUNDING = 1e-9  # relative: what rounding to double precision may add to a bound
+NOTHING = np.float32(0.0)
 
 
 class Scene(NamedTuple):
@@ -33,6 +37,7 @@ class Scene(NamedTuple):
     noise             (n,) variance of the samples over the map's share
     kind              (n,) which ladder a sample uses
     ladder            (kinds, steps, 3) inflated variances v: c v, 1 / v and c log(v / v_min)
+    constant          turns a cost into -2 score, which is comparable between planes
     inflation, least  f times the map's share, and the map's least variance
     prior             (3,) expected cell of the last sample (row, column), cost per squared cell
     turn              (n, 3, 3) rotation of the building's axes to the sensor's, up to the course's heading
@@ -49,6 +54,7 @@ class Scene(NamedTuple):
     noise: Array
     kind: NDArray[np.int64]
     ladder: Array
+    constant: float
     inflation: float
     least: float
     prior: Array
@@ -78,20 +84,38 @@ def _term(squared, low, high, ladder, c):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def plain_bound(g, j, i, level, place, feature, scene, cost, stop):  # type: ignore[no-untyped-def]
-    """`cost` plus the bound of the block at (j, i), given up as soon as it exceeds `stop`; and the samples compared."""
+def plain_bounds(nodes, costs, level, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
+    """Add to the prior costs (k,) of nodes (k, 3) what their poses cost at least, given up beyond `stop`.
+
+    Returns how many nodes were bounded and the samples compared, hardly more than `allowed`.
+    """
+    place, feature, kind, ladder = tree.place, tree.feature, scene.kind, scene.ladder
+    records, codes, places = scene.records, scene.codes, scene.places
     n, c = feature.shape[1], feature.shape[2] // 2
-    records, codes, places, kind, ladder = scene.records, scene.codes, scene.places, scene.kind, scene.ladder
-    for k in range(n):
-        at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
-        squared = 0.0
-        for m in range(c):
-            d = max(max(feature[g, k, m] - records[at, c + m], records[at, m] - feature[g, k, c + m]), 0.0)
-            squared += d * d
-        cost += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder[kind[k]], c)
-        if cost > stop:
-            return cost, k + 1
-    return cost, n
+    work = 0
+    for p in range(len(nodes)):
+        if work >= allowed:
+            return p, work
+        g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
+        known = cost
+        for k in range(n):
+            at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
+            if c == 3:
+                x = max(max(feature[g, k, 0] - records[at, 3], records[at, 0] - feature[g, k, 3]), NOTHING)
+                y = max(max(feature[g, k, 1] - records[at, 4], records[at, 1] - feature[g, k, 4]), NOTHING)
+                z = max(max(feature[g, k, 2] - records[at, 5], records[at, 2] - feature[g, k, 5]), NOTHING)
+                squared = x * x + y * y + z * z
+            else:
+                squared = NOTHING
+                for m in range(c):
+                    x = max(max(feature[g, k, m] - records[at, c + m], records[at, m] - feature[g, k, c + m]), NOTHING)
+                    squared += x * x
+            cost += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder[kind[k]], c)
+            work += 1
+            if cost > stop:
+                break
+        costs[p] = cost - SLACK * (1.0 + cost - known) - ROUNDING * abs(cost)
+    return len(nodes), work
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -105,39 +129,49 @@ def to_sensor(x, y, z, turn, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def pose_cost(g, j, i, place, feature, heading, scene, cost, stop):  # type: ignore[no-untyped-def]
-    """`cost` plus that of the pose of course g whose middle sample is in cell (j, i), given up beyond `stop`; and the
-    samples compared."""
-    n, c = feature.shape[1], feature.shape[2] // 2
-    mean, variance = scene.mean, scene.variance
+def pose_costs(nodes, costs, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
+    """Add to the prior costs (k,) of poses (k, 3) (course, cell of the middle sample) their own, given up beyond `stop`.
+
+    Returns as `plain_bounds`.
+    """
+    place, feature, heading = tree.place, tree.exact, tree.heading
+    mean, variance, turn, noise = scene.mean, scene.variance, scene.turn, scene.noise
+    n, c = feature.shape[1], feature.shape[2]
     ny, nx = mean.shape[0] - 2, mean.shape[1] - 2
     has_offset, precision, relative, least = scene.offset
-    gx, gy, gz, ry, rz = 0.0, 0.0, 0.0, 0.0, 0.0
-    squares, total = 0.0, precision
-    if has_offset:
-        cost += least
-    for k in range(n):
-        a = min(max(j + place[g, k, 0] + 1, 0), ny + 1)
-        b = min(max(i + place[g, k, 1] + 1, 0), nx + 1)
-        v = variance[a, b] + scene.noise[k]
-        w = 1.0 / (scene.inflation * v)
-        rx = feature[g, k, 0] - mean[a, b, 0]
-        if c > 1:
-            ry = feature[g, k, 1] - mean[a, b, 1]
-        if c > 2:
-            rz = feature[g, k, 2] - mean[a, b, 2]
-        squares += w * (rx * rx + ry * ry + rz * rz)
-        cost += c * math.log(v / (scene.least + scene.noise[k]))
-        apart = squares
+    ry, rz = 0.0, 0.0
+    work = 0
+    for p in range(len(nodes)):
+        if work >= allowed:
+            return p, work
+        g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
+        gx, gy, gz, squares, apart, total = 0.0, 0.0, 0.0, 0.0, 0.0, precision
         if has_offset:
-            if scene.headed:
-                rx, ry = heading[g, 0] * rx + heading[g, 1] * ry, heading[g, 0] * ry - heading[g, 1] * rx
-            x, y, z = to_sensor(rx, ry, rz, scene.turn, k)
-            gx, gy, gz = gx + w * x, gy + w * y, gz + w * z
-            total += w
-            apart -= (gx * gx + gy * gy + gz * gz) / total
-        if cost + apart > stop:
-            return cost + apart, k + 1
-    if has_offset:
-        return cost - least + max(apart, 0.0) + c * math.log(total / relative), n
-    return cost + apart, n
+            cost += least
+        for k in range(n):
+            a = min(max(j + place[g, k, 0] + 1, 0), ny + 1)
+            b = min(max(i + place[g, k, 1] + 1, 0), nx + 1)
+            v = variance[a, b] + noise[k]
+            w = 1.0 / (scene.inflation * v)
+            rx = feature[g, k, 0] - mean[a, b, 0]
+            if c > 1:
+                ry = feature[g, k, 1] - mean[a, b, 1]
+            if c > 2:
+                rz = feature[g, k, 2] - mean[a, b, 2]
+            squares += w * (rx * rx + ry * ry + rz * rz)
+            cost += c * math.log(v / (scene.least + noise[k]))
+            apart = squares
+            if has_offset:
+                if scene.headed:
+                    rx, ry = heading[g, 0] * rx + heading[g, 1] * ry, heading[g, 0] * ry - heading[g, 1] * rx
+                x, y, z = to_sensor(rx, ry, rz, turn, k)
+                gx, gy, gz = gx + w * x, gy + w * y, gz + w * z
+                total += w
+                apart = max(squares - (gx * gx + gy * gy + gz * gz) / total, 0.0)
+            work += 1
+            if cost + apart > stop:
+                break
+        if has_offset and cost + apart <= stop:
+            cost += c * math.log(total / relative) - least
+        costs[p] = cost + apart
+    return len(nodes), work

@@ -15,9 +15,9 @@ import math
 import numba
 import numpy as np
 
-from app.positioning.kernels import record_of, to_sensor
+from app.positioning.kernels import ROUNDING, SLACK, record_of, to_sensor
 
-__all__ = ["offset_bound"]
+__all__ = ["offset_bounds"]
 
 _STEPS = 4
 
@@ -38,17 +38,42 @@ def _to_building(x, y, z, turn, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def offset_bound(g, j, i, level, place, feature, heading, scene, cost, stop, box, weight):  # type: ignore[no-untyped-def]
+def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight, turn, n):  # type: ignore[no-untyped-def]
+    """The bound from the distance vectors at offset b."""
+    if precision > 0.0:
+        linear = squares + sx * bx + sy * by + sz * bz
+        quadratic = squares + (sx * sx + sy * sy + sz * sz) / precision
+        if linear > 0.0 and precision > 0.02 * total:
+            return linear * linear / max(quadratic, 1e-300)
+    # l_i = w_i (e_i - R_i u), so that their sum is p b
+    ux, uy, uz = (sx - precision * bx) / total, (sy - precision * by) / total, (sz - precision * bz) / total
+    linear, quadratic = 0.0, precision * (bx * bx + by * by + bz * bz)
+    for k in range(n):
+        w = weight[k]
+        ox, oy, oz = _to_building(bx, by, bz, turn, k)
+        ox, oy = ch * ox - sh * oy, ch * oy + sh * ox
+        vx, vy, vz = _to_building(ux, uy, uz, turn, k)
+        vx, vy = ch * vx - sh * vy, ch * vy + sh * vx
+        lx = _apart(box[k, 0] - ox, box[k, 3] - ox) - vx
+        ly = _apart(box[k, 1] - oy, box[k, 4] - oy) - vy
+        lz = _apart(box[k, 2] - oz, box[k, 5] - oz) - vz
+        quadratic += w * (lx * lx + ly * ly + lz * lz)
+        linear += w * (min(lx * box[k, 0], lx * box[k, 3]) + min(ly * box[k, 1], ly * box[k, 4])
+                       + min(lz * box[k, 2], lz * box[k, 5]))  # fmt: skip
+    return linear * linear / max(quadratic, 1e-300) if linear > 0.0 else 0.0
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _offset_bound(  # type: ignore[no-untyped-def]
+    g, j, i, level, place, feature, heading, kind, ladder, records, codes, places, turn, headed, offset, cost, stop, box, weight
+):
     """`cost` plus the bound of the block at (j, i), given up as soon as it exceeds `stop`; and the samples compared.
 
     box (n, 6), weight (n,): room to work in
     """
     n, c = feature.shape[1], feature.shape[2] // 2
-    _, precision, relative, least = scene.offset
-    records, codes, places, kind, ladder, turn = (
-        scene.records, scene.codes, scene.places, scene.kind, scene.ladder, scene.turn
-    )  # fmt: skip
-    ch, sh = (heading[g, 0], heading[g, 1]) if scene.headed else (1.0, 0.0)
+    _, precision, relative, least = offset
+    ch, sh = (heading[g, 0], heading[g, 1]) if headed else (1.0, 0.0)
     prior_variance = 1.0 / precision if precision > 0.0 else 0.0
     squares, sx, sy, sz, total = 0.0, 0.0, 0.0, 0.0, precision
     hx, hy, hz = precision, precision, precision
@@ -112,26 +137,21 @@ def offset_bound(g, j, i, level, place, feature, heading, scene, cost, stop, box
 
 
 @numba.njit(cache=True, nogil=True)
-def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight, turn, n):  # type: ignore[no-untyped-def]
-    """The bound from the distance vectors at offset b."""
-    if precision > 0.0:
-        linear = squares + sx * bx + sy * by + sz * bz
-        quadratic = squares + (sx * sx + sy * sy + sz * sz) / precision
-        if linear > 0.0 and precision > 0.02 * total:
-            return linear * linear / max(quadratic, 1e-300)
-    # l_i = w_i (e_i - R_i u), so that their sum is p b
-    ux, uy, uz = (sx - precision * bx) / total, (sy - precision * by) / total, (sz - precision * bz) / total
-    linear, quadratic = 0.0, precision * (bx * bx + by * by + bz * bz)
-    for k in range(n):
-        w = weight[k]
-        ox, oy, oz = _to_building(bx, by, bz, turn, k)
-        ox, oy = ch * ox - sh * oy, ch * oy + sh * ox
-        vx, vy, vz = _to_building(ux, uy, uz, turn, k)
-        vx, vy = ch * vx - sh * vy, ch * vy + sh * vx
-        lx = _apart(box[k, 0] - ox, box[k, 3] - ox) - vx
-        ly = _apart(box[k, 1] - oy, box[k, 4] - oy) - vy
-        lz = _apart(box[k, 2] - oz, box[k, 5] - oz) - vz
-        quadratic += w * (lx * lx + ly * ly + lz * lz)
-        linear += w * (min(lx * box[k, 0], lx * box[k, 3]) + min(ly * box[k, 1], ly * box[k, 4])
-                       + min(lz * box[k, 2], lz * box[k, 5]))  # fmt: skip
-    return linear * linear / max(quadratic, 1e-300) if linear > 0.0 else 0.0
+def offset_bounds(nodes, costs, level, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
+    """As `plain_bounds`."""
+    place, feature, heading, kind, ladder = tree.place, tree.feature, tree.heading, scene.kind, scene.ladder
+    records, codes, places, turn = scene.records, scene.codes, scene.places, scene.turn
+    n, c = feature.shape[1], feature.shape[2] // 2
+    box, weight = np.zeros((n, 6)), np.empty(n)
+    work = 0
+    for p in range(len(nodes)):
+        if work >= allowed:
+            return p, work
+        known = costs[p]
+        bound, used = _offset_bound(
+            nodes[p, 0], nodes[p, 1], nodes[p, 2], level, place, feature, heading, kind, ladder, records, codes, places, turn,
+            scene.headed, scene.offset, known, stop, box, weight,
+        )  # fmt: skip
+        costs[p] = bound - SLACK * (1.0 + bound - known) - ROUNDING * abs(bound)
+        work += used
+    return len(nodes), work

@@ -23,8 +23,8 @@ def make_scene(
     prior: PosePrior,
     error: WindowError,
     walkable: NDArray[np.bool_] | None,
-) -> tuple[Scene, float, float]:
-    """The scene, the constant that turns its costs into -2 score, and the cost of a pose that matches, constant included."""
+) -> tuple[Scene, float]:
+    """The scene, and the cost of a pose that matches."""
     n, c = window.features_uT.shape
     precision = error.offset_precision
     inflation = error.inflation * error.own_share
@@ -46,10 +46,10 @@ def make_scene(
     scene = Scene(
         plane.mean_uT, plane.variance_uT2, plane.pyramid.records, plane.pyramid.records.view(np.uint8),
         plane.pyramid.places, np.zeros((0, 0), dtype=np.int64) if walkable is None else _summed(walkable), noise, kind,
-        ladder, inflation, least, cells, turn, bool(window.turns and len(window.tilt)),
+        ladder, constant, inflation, least, cells, turn, bool(window.turns and len(window.tilt)),
         (precision is not None, precision or 0.0, weight, c * math.log(lightest / weight)),
     )  # fmt: skip
-    return scene, constant, usual
+    return scene, usual
 
 
 def telling_order(window: ReducedWindow, plane: Plane) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.positioning.course_tree import CourseTree, course_tree
-from app.positioning.descent import bound_nodes, dive, split_nodes, top_nodes
+from app.positioning.descent import bound_nodes, dive, sift, split_nodes, top_nodes
 from app.positioning.floors import Plane
 from app.positioning.kernels import Scene
 from app.positioning.lattice import Courses, ReducedWindow, turn_window
@@ -38,6 +38,7 @@ _DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _SPARE_NATS = 12.0  # how far beyond the limit a bound is followed, so that the missed mass comes out small
 _CHUNK = 4_000  # nodes split between two looks at the caller's patience
+_ENDLESS = 1 << 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,10 +65,10 @@ class Candidates:
 
 
 class _OnPlane:
-    """The tree over one plane; `constant` turns a cost into -2 score, comparable between planes."""
+    """The tree over one plane."""
 
-    def __init__(self, scene: Scene, constant: float, tree: CourseTree, compared: int, top: int) -> None:
-        self.scene, self.constant, self.courses, self.compared, self.top = scene, constant, tree, compared, top
+    def __init__(self, scene: Scene, tree: CourseTree, compared: int, top: int) -> None:
+        self.scene, self.courses, self.compared, self.top = scene, tree, compared, top
         self.tree = tree.tree
         self.ny, self.nx = scene.mean.shape[0] - 2, scene.mean.shape[1] - 2
 
@@ -77,32 +78,31 @@ class _OnPlane:
         row, column = (int(middle[:, k].min()) // side * side for k in (0, 2))
         height = (self.ny - 1 + int(middle[:, 1].max()) - row) // side + 1
         width = (self.nx - 1 + int(middle[:, 3].max()) - column) // side + 1
+        nodes: Nodes
+        costs: Array
         nodes, costs = top_nodes(stage.first, stage.last, self.top, row, column, height, width, self.tree, self.scene)
-        return nodes, costs + self.constant
+        return nodes, costs
 
-    def bound(self, nodes: Nodes, costs: Array, stop: float) -> int:
-        """Replace the costs of top nodes by their bounds; returns the values compared."""
-        below = costs - self.constant
-        used: int = bound_nodes(nodes, below, self.top, self.tree, self.scene, stop - self.constant)
-        costs[:] = below + self.constant
-        return used * self.compared
+    def split(self, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array, Array]:
+        """The parts of nodes one level down, their prior costs, and the bounds of what they are parts of."""
+        parts: Nodes
+        costs: Array
+        known: Array
+        parts, costs, known = split_nodes(nodes, bounds, level, self.tree, self.scene)
+        return parts, costs, known
 
-    def split(
-        self, nodes: Nodes, level: int, keep: float, stop: float, best: float, allowed: int
-    ) -> tuple[Nodes, Array, int, int, float]:
-        c = self.constant
-        parts, bounds, done, used, missed = split_nodes(
-            nodes, level, self.tree, self.scene, keep - c, stop - c, best - c, allowed // self.compared
-        )
-        return parts, bounds + c, done, used * self.compared, missed
+    def bound(self, nodes: Nodes, costs: Array, level: int, stop: float, allowed: int) -> tuple[int, int]:
+        """Turn prior costs into bounds, of as many nodes as allowed; returns how many, and the values compared."""
+        done, used = bound_nodes(nodes, costs, level, self.tree, self.scene, stop, allowed // self.compared)
+        return int(done), int(used) * self.compared
 
     def dive(self, nodes: Nodes, bounds: Array, level: int, stop: float) -> tuple[Nodes, float]:
         """A good pose (1, 3) below some nodes, and its cost; none (0, 3) if none of them holds one."""
         beam = _BEAM
         while True:
-            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, stop - self.constant)
+            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, stop)
             if len(pose) or beam >= len(nodes):
-                return pose, float(cost) + self.constant
+                return pose, float(cost)
             beam *= 8
 
     def most(self, nodes: Nodes) -> int:
@@ -110,6 +110,13 @@ class _OnPlane:
         g = nodes[:, 0]
         parts = int(np.maximum(self.tree.first[g + 1] - self.tree.first[g], 1).sum())
         return 4 * parts * self.compared * self.tree.feature.shape[1]
+
+    def sift(self, nodes: Nodes, bounds: Array, level: int, keep: float, best: float) -> tuple[Nodes, Array, float]:
+        """The nodes with bounds up to `keep`, and the mass, relative to a pose of cost `best`, of the others at most."""
+        left: Nodes
+        least: Array
+        left, least, missed = sift(nodes, bounds, level, self.tree, self.scene, keep, best)
+        return left, least, float(missed)
 
     def poses(self, nodes: Nodes, level: int) -> Array:
         """How many poses nodes hold at most."""
@@ -178,7 +185,7 @@ def _on_planes(
     trees: dict[float, CourseTree] = {}
     on_planes, expected = [], -np.inf
     for plane, walkable in zip(planes, prior.walkable or [None] * len(planes), strict=True):
-        scene, constant, usual = make_scene(plane, window, order, prior, error, walkable)
+        scene, usual = make_scene(plane, window, order, prior, error, walkable)
         if plane.resolution_m not in trees:
             steep = max(p.gradient_uT_per_m for p in planes) * plane.resolution_m
             trees[plane.resolution_m] = course_tree(
@@ -187,7 +194,7 @@ def _on_planes(
                 _SHARE, scene.headed,
             )  # fmt: skip
         tree = trees[plane.resolution_m]
-        on_planes.append(_OnPlane(scene, constant, tree, window.features_uT.shape[1], _top(plane, window, tree, error, budget)))
+        on_planes.append(_OnPlane(scene, tree, window.features_uT.shape[1], _top(plane, window, tree, error, budget)))
         expected = max(expected, usual)
     return on_planes, expected
 
@@ -265,11 +272,7 @@ class _Sweep:
             left -= self._bound(on_plane, nodes[again], more, self._stop())
             bounds[again] = np.maximum(more, bounds[again])
         for level in range(on_plane.top - 1, -1, -1):
-            keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
-            self.miss(on_plane.poses(nodes[~keep], level + 1), bounds[~keep])
-            nodes, bounds = nodes[keep], bounds[keep]
-            if not len(nodes):
-                break
+            nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
             if len(nodes) > _DIVE_AGAIN:
                 pose, cost = on_plane.dive(nodes, bounds, level + 1, self._stop())
                 if cost < start.seed_cost:
@@ -297,13 +300,13 @@ class _Sweep:
         return nodes[keep], costs[keep]
 
     def _bound(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, stop: float) -> int:
-        """Bound top nodes, those that are reached in time."""
+        """Bound top nodes, those that are reached in time; returns the values compared."""
         used = 0
         for first in range(0, len(nodes), 8 * _CHUNK):
             if self.patience.over():
                 break
             part = slice(first, first + 8 * _CHUNK)
-            used += on_plane.bound(nodes[part], bounds[part], stop)
+            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, stop, _ENDLESS)[1]
         return used
 
     def _split(
@@ -316,20 +319,37 @@ class _Sweep:
         if on_plane.most(nodes) > allowed:
             order = np.argsort(bounds, kind="stable")
             nodes, bounds = nodes[order], bounds[order]
-        found: list[tuple[Nodes, Array]] = []
+        found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))]
         done = used = 0
         while done < len(nodes) and used < allowed and not self.patience.over():
-            parts, costs, reached, compared, missed = on_plane.split(
-                nodes[done : done + _CHUNK], level, self.best + self.window, self._stop(), self.best, allowed - used
-            )
-            found.append((parts, costs))
-            done, used, self.missed_mass = done + reached, used + compared, self.missed_mass + missed
+            part = slice(done, done + _CHUNK)
+            parts, costs, known = on_plane.split(nodes[part], bounds[part], level)
+            reached, compared = on_plane.bound(parts, costs, level, self._stop(), allowed - used)
+            if reached < len(parts):
+                self._leave(on_plane, parts[reached:], known[reached:], level)
+            *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best + self.window, self.best)
+            found.append((kept[0], kept[1]))
+            done, used, self.missed_mass = done + _CHUNK, used + compared, self.missed_mass + missed
         if done < len(nodes):
-            self.miss(on_plane.poses(nodes[done:], level + 1), bounds[done:])
-            self.window = min(self.window, max(float(bounds[done:].min()) - self.best, 0.0))
-        if not found:
-            return np.empty((0, 3), np.int32), np.empty(0), used
+            self._leave(on_plane, nodes[done:], bounds[done:], level + 1)
+        if len(found) == 2:
+            return *found[1], used
         return np.concatenate([parts for parts, _ in found]), np.concatenate([costs for _, costs in found]), used
+
+    def _leave(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> None:
+        """Leave out nodes that were not reached: the window ends where they may begin."""
+        self.miss(on_plane.poses(nodes, level), bounds)
+        self.window = min(self.window, max(float(bounds.min()) - self.best, 0.0))
+
+    def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
+        """Those within the window; it shrinks when they are more than there is room for."""
+        nodes, bounds, missed = on_plane.sift(nodes, bounds, level, self.best + self.window, self.best)
+        self.missed_mass += missed
+        if len(nodes) > _NODES_PER_POSE * self.capacity:
+            keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
+            self.miss(on_plane.poses(nodes[~keep], level), bounds[~keep])
+            nodes, bounds = nodes[keep], bounds[keep]
+        return nodes, bounds
 
     def _improve(self, cost: float) -> None:
         if cost < self.best:
