@@ -34,6 +34,7 @@ class Tree(NamedTuple):
     heading   (g, 2) cosine and sine of one of its headings
     cost      (g,) least -2 log prior
     leaves    (g,) courses held
+    size      (g,) twice the log of it
     first     (g + 1,) where a group's parts in the stage below begin in `part`
     part      groups of the stage below; courses alone have none, they stay
     """
@@ -45,6 +46,7 @@ class Tree(NamedTuple):
     heading: Array
     cost: Array
     leaves: Index
+    size: Array
     first: Index
     part: Index
 
@@ -121,7 +123,7 @@ def course_tree(
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
     part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
-    return CourseTree(Tree(place, feature, exact, middle, heading, cost, leaves, first, part), tuple(stages))
+    return CourseTree(Tree(place, feature, exact, middle, heading, cost, leaves, 2.0 * np.log(leaves), first, part), tuple(stages))
 
 
 def _counts(courses: Courses) -> tuple[int, int, int]:

@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from app.positioning.kernels import plain_bounds, pose_costs
+from app.positioning.kernels import limit_of, plain_bounds, pose_costs, spare_cost
 from app.positioning.offset_bound import offset_bounds
 
 __all__ = ["bound_nodes", "dive", "sift", "split_nodes", "top_nodes"]
@@ -52,14 +52,14 @@ def top_nodes(first, last, level, row, column, height, width, tree, scene):  # t
 
 
 @numba.njit(cache=True, nogil=True)
-def bound_nodes(nodes, costs, level, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
+def bound_nodes(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
     """Turn the prior costs (k,) of nodes (k, 3) into bounds of their poses' costs, at level zero into these, given up
-    beyond `stop`. Returns how many nodes were reached, and the samples compared, hardly more than `allowed`."""
+    beyond their `limit_of`. Returns how many nodes were reached, and the samples compared, hardly more than `allowed`."""
     if level == 0:
-        return pose_costs(nodes, costs, tree, scene, stop, allowed)
+        return pose_costs(nodes, costs, tree, scene, best, window, allowed)
     if scene.offset[0]:
-        return offset_bounds(nodes, costs, level, tree, scene, stop, allowed)
-    return plain_bounds(nodes, costs, level, tree, scene, stop, allowed)
+        return offset_bounds(nodes, costs, level, tree, scene, best, window, allowed)
+    return plain_bounds(nodes, costs, level, tree, scene, best, window, allowed)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -90,38 +90,39 @@ def split_nodes(nodes, bounds, level, tree, scene):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
-def sift(nodes, bounds, level, tree, scene, keep, best):  # type: ignore[no-untyped-def]
-    """The nodes whose bounds are at most `keep`, their bounds, and the mass relative to a pose of cost `best` that the
-    others hold at most."""
-    leaves = tree.leaves
+def sift(nodes, bounds, level, tree, scene, best, window):  # type: ignore[no-untyped-def]
+    """The nodes whose bounds are within their `limit_of`, their bounds, and the mass relative to a pose of cost `best`
+    that the others hold at most."""
+    leaves, size, spare = tree.leaves, tree.size, spare_cost(level, scene.mean)
     cells = float(min(1 << level, scene.mean.shape[0] - 2) * min(1 << level, scene.mean.shape[1] - 2))
     kept, missed = 0, 0.0
     for p in range(len(nodes)):
-        if bounds[p] <= keep:
+        if bounds[p] <= limit_of(size[nodes[p, 0]], spare, best, window):
             kept += 1
         elif bounds[p] < best + _NEGLIGIBLE:
             missed += leaves[nodes[p, 0]] * cells * math.exp(min(0.5 * (best - bounds[p]), 300.0))
     left, least = np.empty((kept, 3), dtype=np.int32), np.empty(kept)
     k = 0
     for p in range(len(nodes)):
-        if bounds[p] <= keep:
+        if bounds[p] <= limit_of(size[nodes[p, 0]], spare, best, window):
             left[k, 0], left[k, 1], left[k, 2], least[k] = nodes[p, 0], nodes[p, 1], nodes[p, 2], bounds[p]
             k += 1
     return left, least, missed
 
 
 @numba.njit(cache=True, nogil=True)
-def dive(nodes, bounds, level, beam, tree, scene, stop):  # type: ignore[no-untyped-def]
+def dive(nodes, bounds, level, beam, tree, scene, best):  # type: ignore[no-untyped-def]
     """Follow the `beam` most promising nodes of a level down to a pose: (course, row, column) of its middle, and its
-    cost; above `stop` it need not be the best of the beam, nor its cost exact. None (0, 3) if the beam holds none."""
+    cost; if that is not below `best`, it need not be the best of the beam, nor the cost exact. None (0, 3) if the beam
+    holds none."""
     while level > 0 and len(nodes):
         if len(nodes) > beam:
             chosen = np.flatnonzero(bounds <= np.partition(bounds, beam)[beam])[: 2 * beam]
             nodes, bounds = nodes[chosen], bounds[chosen]
         level -= 1
         nodes, bounds, _ = split_nodes(nodes, bounds, level, tree, scene)
-        bound_nodes(nodes, bounds, level, tree, scene, stop, 1 << 60)
+        bound_nodes(nodes, bounds, level, tree, scene, best, 0.0, 1 << 60)
     if not len(nodes):
         return nodes, np.inf
-    best = np.argmin(bounds)
-    return nodes[best : best + 1].copy(), bounds[best]
+    least = np.argmin(bounds)
+    return nodes[least : least + 1].copy(), bounds[least]

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["NOTHING", "ROUNDING", "SLACK", "Scene", "plain_bounds", "pose_costs", "record_of", "to_sensor"]
+__all__ = ["NOTHING", "ROUNDING", "SLACK", "Scene", "limit_of", "plain_bounds", "pose_costs", "record_of", "spare_cost", "to_sensor"]
 
 SLACK = 2e-6  # relative: what rounding to single precision may add to the terms of a bound
 ROUNDING = 1e-9  # relative: what rounding to double precision may add to a bound
+LEFT_OUT = 3e-5  # mass relative to the best pose that a node may hold that is left out
 NOTHING = np.float32(0.0)
 
 
@@ -64,6 +65,20 @@ class Scene(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+def spare_cost(level, mean):  # type: ignore[no-untyped-def]
+    """Twice the nats below the best pose at which all cells of a block together hold a mass of `LEFT_OUT`."""
+    side = 1 << level
+    return 2.0 * math.log(min(side, mean.shape[0] - 2) * min(side, mean.shape[1] - 2) / LEFT_OUT)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def limit_of(size, spare, best, window):  # type: ignore[no-untyped-def]
+    """The bound beyond which a node is left out: its poses are outside the window of the best pose, and all of them
+    together hold next to no mass. `size`: twice the log of the number of its courses."""
+    return best + max(window, size + spare)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def record_of(j, i, l, places):  # type: ignore[no-untyped-def]
     """Index of the record that covers the square of level l (from one) at (j, i)."""
     base, shift = places[l - 1, 0], places[l - 1, 1]
@@ -84,20 +99,21 @@ def _term(squared, low, high, ladder, c):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def plain_bounds(nodes, costs, level, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
-    """Add to the prior costs (k,) of nodes (k, 3) what their poses cost at least, given up beyond `stop`.
+def plain_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
+    """Add to the prior costs (k,) of nodes (k, 3) what their poses cost at least, given up beyond their `limit_of`.
 
     Returns how many nodes were bounded and the samples compared, hardly more than `allowed`.
     """
     place, feature, kind, ladder = tree.place, tree.feature, scene.kind, scene.ladder
     records, codes, places = scene.records, scene.codes, scene.places
     n, c = feature.shape[1], feature.shape[2] // 2
+    spare = spare_cost(level, scene.mean)
     work = 0
     for p in range(len(nodes)):
         if work >= allowed:
             return p, work
         g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
-        known = cost
+        known, stop = cost, limit_of(tree.size[g], spare, best, window)
         for k in range(n):
             at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
             if c == 3:
@@ -129,8 +145,9 @@ def to_sensor(x, y, z, turn, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def pose_costs(nodes, costs, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
-    """Add to the prior costs (k,) of poses (k, 3) (course, cell of the middle sample) their own, given up beyond `stop`.
+def pose_costs(nodes, costs, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
+    """Add to the prior costs (k,) of poses (k, 3) (course, cell of the middle sample) their own, given up
+    beyond their `limit_of`.
 
     Returns as `plain_bounds`.
     """
@@ -140,6 +157,7 @@ def pose_costs(nodes, costs, tree, scene, stop, allowed):  # type: ignore[no-unt
     ny, nx = mean.shape[0] - 2, mean.shape[1] - 2
     has_offset, precision, relative, least = scene.offset
     ry, rz = 0.0, 0.0
+    stop = limit_of(0.0, spare_cost(0, mean), best, window)
     work = 0
     for p in range(len(nodes)):
         if work >= allowed:

@@ -15,7 +15,7 @@ import math
 import numba
 import numpy as np
 
-from app.positioning.kernels import ROUNDING, SLACK, record_of, to_sensor
+from app.positioning.kernels import ROUNDING, SLACK, limit_of, record_of, spare_cost, to_sensor
 
 __all__ = ["offset_bounds"]
 
@@ -137,17 +137,18 @@ def _offset_bound(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def offset_bounds(nodes, costs, level, tree, scene, stop, allowed):  # type: ignore[no-untyped-def]
+def offset_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
     """As `plain_bounds`."""
     place, feature, heading, kind, ladder = tree.place, tree.feature, tree.heading, scene.kind, scene.ladder
     records, codes, places, turn = scene.records, scene.codes, scene.places, scene.turn
     n, c = feature.shape[1], feature.shape[2] // 2
     box, weight = np.zeros((n, 6)), np.empty(n)
+    spare = spare_cost(level, scene.mean)
     work = 0
     for p in range(len(nodes)):
         if work >= allowed:
             return p, work
-        known = costs[p]
+        known, stop = costs[p], limit_of(tree.size[nodes[p, 0]], spare, best, window)
         bound, used = _offset_bound(
             nodes[p, 0], nodes[p, 1], nodes[p, 2], level, place, feature, heading, kind, ladder, records, codes, places, turn,
             scene.headed, scene.offset, known, stop, box, weight,

@@ -36,7 +36,6 @@ _SHARE = 1.0  # of a block's side, by which a group of courses may spread the sa
 _BEAM = 16
 _DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
-_SPARE_NATS = 12.0  # how far beyond the limit a bound is followed, so that the missed mass comes out small
 _CHUNK = 4_000  # nodes split between two looks at the caller's patience
 _ENDLESS = 1 << 60
 
@@ -91,16 +90,18 @@ class _OnPlane:
         parts, costs, known = split_nodes(nodes, bounds, level, self.tree, self.scene)
         return parts, costs, known
 
-    def bound(self, nodes: Nodes, costs: Array, level: int, stop: float, allowed: int) -> tuple[int, int]:
+    def bound(
+        self, nodes: Nodes, costs: Array, level: int, best: float, window: float, allowed: int
+    ) -> tuple[int, int]:
         """Turn prior costs into bounds, of as many nodes as allowed; returns how many, and the values compared."""
-        done, used = bound_nodes(nodes, costs, level, self.tree, self.scene, stop, allowed // self.compared)
+        done, used = bound_nodes(nodes, costs, level, self.tree, self.scene, best, window, allowed // self.compared)
         return int(done), int(used) * self.compared
 
-    def dive(self, nodes: Nodes, bounds: Array, level: int, stop: float) -> tuple[Nodes, float]:
-        """A good pose (1, 3) below some nodes, and its cost; none (0, 3) if none of them holds one."""
+    def dive(self, nodes: Nodes, bounds: Array, level: int, best: float) -> tuple[Nodes, float]:
+        """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds one."""
         beam = _BEAM
         while True:
-            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, stop)
+            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, best)
             if len(pose) or beam >= len(nodes):
                 return pose, float(cost)
             beam *= 8
@@ -111,11 +112,11 @@ class _OnPlane:
         parts = int(np.maximum(self.tree.first[g + 1] - self.tree.first[g], 1).sum())
         return 4 * parts * self.compared * self.tree.feature.shape[1]
 
-    def sift(self, nodes: Nodes, bounds: Array, level: int, keep: float, best: float) -> tuple[Nodes, Array, float]:
-        """The nodes with bounds up to `keep`, and the mass, relative to a pose of cost `best`, of the others at most."""
+    def sift(self, nodes: Nodes, bounds: Array, level: int, best: float, window: float) -> tuple[Nodes, Array, float]:
+        """The nodes that may matter, and the mass, relative to a pose of cost `best`, of the others at most."""
         left: Nodes
         least: Array
-        left, least, missed = sift(nodes, bounds, level, self.tree, self.scene, keep, best)
+        left, least, missed = sift(nodes, bounds, level, self.tree, self.scene, best, window)
         return left, least, float(missed)
 
     def poses(self, nodes: Nodes, level: int) -> Array:
@@ -147,7 +148,6 @@ def search(
     """
     on_planes, expected = _on_planes(planes, window, courses, prior, error, budget)
     sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget, _Patience(out_of_time))
-    expected += sweep.window + 2.0 * _SPARE_NATS
     starts = [sweep.start(on_plane, expected) for on_plane in on_planes]
     ranks = np.argsort([start.least for start in starts], kind="stable")
     for k in ranks:  # the most promising first, until a pose is as good as one that matches
@@ -266,15 +266,13 @@ class _Sweep:
     def run(self, on_plane: _OnPlane, start: _Start) -> tuple[Nodes, Array]:
         """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
         nodes, bounds, left = start.nodes, start.bounds, self.budget - start.used
-        if self._stop() > start.followed_to:
-            again = bounds <= self._stop()
-            more = start.prior_costs[again]
-            left -= self._bound(on_plane, nodes[again], more, self._stop())
-            bounds[again] = np.maximum(more, bounds[again])
+        if self.best > start.followed_to:
+            bounds = start.prior_costs.copy()
+            left -= self._bound(on_plane, nodes, bounds, self.best)
         for level in range(on_plane.top - 1, -1, -1):
             nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
             if len(nodes) > _DIVE_AGAIN:
-                pose, cost = on_plane.dive(nodes, bounds, level + 1, self._stop())
+                pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best)
                 if cost < start.seed_cost:
                     start.seed, start.seed_cost = pose, cost
                     self._improve(cost)
@@ -299,14 +297,14 @@ class _Sweep:
         self.miss(np.ones(len(costs) - int(keep.sum())), costs[~keep])
         return nodes[keep], costs[keep]
 
-    def _bound(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, stop: float) -> int:
+    def _bound(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, best: float) -> int:
         """Bound top nodes, those that are reached in time; returns the values compared."""
         used = 0
         for first in range(0, len(nodes), 8 * _CHUNK):
             if self.patience.over():
                 break
             part = slice(first, first + 8 * _CHUNK)
-            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, stop, _ENDLESS)[1]
+            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, best, self.window, _ENDLESS)[1]
         return used
 
     def _split(
@@ -324,10 +322,10 @@ class _Sweep:
         while done < len(nodes) and used < allowed and not self.patience.over():
             part = slice(done, done + _CHUNK)
             parts, costs, known = on_plane.split(nodes[part], bounds[part], level)
-            reached, compared = on_plane.bound(parts, costs, level, self._stop(), allowed - used)
+            reached, compared = on_plane.bound(parts, costs, level, self.best, self.window, allowed - used)
             if reached < len(parts):
                 self._leave(on_plane, parts[reached:], known[reached:], level)
-            *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best + self.window, self.best)
+            *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best, self.window)
             found.append((kept[0], kept[1]))
             done, used, self.missed_mass = done + _CHUNK, used + compared, self.missed_mass + missed
         if done < len(nodes):
@@ -343,7 +341,7 @@ class _Sweep:
 
     def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
         """Those within the window; it shrinks when they are more than there is room for."""
-        nodes, bounds, missed = on_plane.sift(nodes, bounds, level, self.best + self.window, self.best)
+        nodes, bounds, missed = on_plane.sift(nodes, bounds, level, self.best, self.window)
         self.missed_mass += missed
         if len(nodes) > _NODES_PER_POSE * self.capacity:
             keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
@@ -355,9 +353,6 @@ class _Sweep:
         if cost < self.best:
             self.missed_mass *= float(np.exp(0.5 * (cost - self.best)))
             self.best = cost
-
-    def _stop(self) -> float:
-        return self.best + self.window + 2.0 * _SPARE_NATS
 
     def _keep(self, bounds: Array, room: int) -> NDArray[np.bool_]:
         """Which to follow: those within the window, which shrinks when they are more than there is room for."""
