@@ -3,7 +3,8 @@
 Level l answers for the square of side s = 2^l whose first cell is (j, i), wherever that lies: one lookup whatever the
 displacement of a block of poses. Starts are kept every q = max(1, s / 4) cells, for squares that much larger, so that
 high levels stay small enough for the processor's caches. Cells off the grid hold the prior. Variances are kept as
-one-byte codes of a logarithmic ladder, rounded outwards, beside the bounds of the mean in the same record.
+one-byte codes of a logarithmic ladder, rounded outwards, beside the bounds of the mean in the same record. All levels
+lie in one array, so that a search may take each of its lookups from another level; a last record covers everything.
 """
 
 from dataclasses import dataclass
@@ -27,8 +28,8 @@ _Cells = TypeVar("_Cells", Float32, Codes)
 class Level:
     """Bounds over squares of `side` cells: that at (j, i) is in record [(j + base) // step, (i + base) // step].
 
-    records   (h, w, 2 c + 1) float32: c lower then c upper bounds of the mean, uT, then, as two bytes, the ladder
-              positions at or below and at or above every variance in the square
+    records   (h, w, width) float32: c lower then c upper bounds of the mean, uT, then, as two bytes, the ladder
+              positions at or below and at or above every variance in the square, then nothing up to the width
     step      cells between records, a power of two; base = side + step. Indices beyond the array: the nearest record
     """
 
@@ -43,14 +44,20 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """levels[l - 1] holds squares of 2^l cells; ladder_uT2 (LADDER_STEPS,) ascends from the smallest variance."""
+    """levels[l - 1] holds squares of 2^l cells; ladder_uT2 (LADDER_STEPS,) ascends from the smallest variance.
+
+    records   (k, width) of all levels, row by row, the smallest squares first, then one that covers all cells
+    places    (levels + 1, 5) where a level's lie among them: base, log2 of its step, height, width, first record
+    """
 
     levels: tuple[Level, ...]
     ladder_uT2: Array
+    records: Float32
+    places: NDArray[np.int64]
 
     @property
     def nbytes(self) -> int:
-        return self.ladder_uT2.nbytes + sum(level.records.nbytes for level in self.levels)
+        return self.ladder_uT2.nbytes + self.records.nbytes + self.places.nbytes
 
 
 def variance_ladder(variance_uT2: Array | Float32) -> Array:
@@ -66,18 +73,36 @@ def build_pyramid(mean_uT: Float32, variance_uT2: Float32, levels: int) -> Pyram
     cell of prior on each side."""
     ladder = variance_ladder(variance_uT2)
     bounds, codes = np.concatenate([mean_uT, mean_uT], axis=2), _codes(variance_uT2.astype(np.float64), ladder)
+    whole = np.concatenate([mean_uT.min(axis=(0, 1)), mean_uT.max(axis=(0, 1))])[None, None]
+    extremes = np.array([codes[..., 0].min(), codes[..., 1].max()], dtype=np.uint8)[None, None]
     built = []
     for level in range(1, levels + 1):
         side = 1 << level
         bounds, codes = _doubled(bounds, side), _doubled(codes, side)
         step = max(1, side // 4)
-        built.append(Level(side, step, _records(_thinned(bounds, side, step), _thinned(codes, side, step))))
-    return Pyramid(tuple(built), ladder)
+        built.append((side, step, _records(_thinned(bounds, side, step), _thinned(codes, side, step))))
+    return _gathered(built, _records(whole, extremes), ladder)
+
+
+def _gathered(built: list[tuple[int, int, Float32]], whole: Float32, ladder: Array) -> Pyramid:
+    """Levels, as (side, step, records), and the record of everything in one array."""
+    places, first = [], 0
+    for side, step, own in built:
+        places.append((side + step, step.bit_length() - 1, own.shape[0], own.shape[1], first))
+        first += own.shape[0] * own.shape[1]
+    places.append((0, 0, 1, 1, first))
+    records = np.concatenate([own.reshape(-1, own.shape[2]) for own in (*(own for _, _, own in built), whole)])
+    levels = tuple(
+        Level(side, step, records[start : start + height * width].reshape(own.shape))
+        for (side, step, own), (_, _, height, width, start) in zip(built, places, strict=False)
+    )
+    return Pyramid(levels, ladder, records, np.array(places, dtype=np.int64))
 
 
 def _records(bounds: Float32, codes: Codes) -> Float32:
+    """Bounds and codes side by side; records of three components fill 32 bytes, which no cache line parts."""
     c = bounds.shape[2] // 2
-    records = np.zeros((*bounds.shape[:2], 2 * c + 1), dtype=np.float32)
+    records = np.zeros((*bounds.shape[:2], 2 * c + 2 if c == 3 else 2 * c + 1), dtype=np.float32)
     records[..., : 2 * c] = bounds
     records.view(np.uint8)[..., 8 * c : 8 * c + 2] = codes
     return records

@@ -96,7 +96,8 @@ class Turned:
     """A window at every course.
 
     features_uT (h, n, c), offset_cells (h, n, 2) (row, column) from the last sample, turn (h, n, 2) cosine and sine of
-    the sensor's yaw in the building frame
+    the sensor's yaw in the building frame as told: heading and yaw, without the drift, which is small and which an
+    offset of the sensor must not turn with, so that a heading turns the offsets of all samples alike
     """
 
     features_uT: Array
@@ -249,7 +250,7 @@ def turn_window(window: ReducedWindow, courses: Courses, resolution_m: float) ->
         x, y = window.features_uT[:, 0], window.features_uT[:, 1]
         features[..., 0], features[..., 1] = c * x - s * y, s * x + c * y
     if window.components == "vector":
-        sensor = window.yaw_rad + (yaw if window.turns else 0.0 * yaw)
+        sensor = window.yaw_rad + (courses.heading_rad[:, None] if window.turns else 0.0 * yaw)
         turn[..., 0], turn[..., 1] = np.cos(sensor), np.sin(sensor)
     return Turned(features, offsets, turn)
 

@@ -171,7 +171,7 @@ def _residuals(
     turned = np.zeros_like(z)
     turn = np.stack([np.ones_like(yaw), np.zeros_like(yaw)], axis=-1)
     if window.components == "vector":
-        sensor = window.yaw_rad + (yaw if window.turns else 0.0)
+        sensor = window.yaw_rad + (pose[:, 2, None] if window.turns else 0.0)
         turn = np.broadcast_to(np.stack([np.cos(sensor), np.sin(sensor)], axis=-1), turn.shape)
     if window.turns:
         cy, sy = np.cos(yaw), np.sin(yaw)

@@ -1,10 +1,11 @@
 """Exact global search: branch and bound over the poses of all candidate floors, with one shared incumbent.
 
-Returns the pose an exhaustive scan would return, and every pose within a window of it (see `kernels` for the bound).
-A beam of promising blocks finds a good incumbent first; then every level of blocks is bounded, pruned and split, all
-courses at once. What was pruned is bounded too: `missed_mass` says how much posterior it could hold at most. The work
-is limited by a budget, counted and not timed, and by the caller's patience: where either ends first, fewer blocks are
-followed, the others but bounded.
+Returns the pose an exhaustive scan would return, and every pose within a window of it. The tree is joint: a node holds
+the poses of a group of courses whose middle sample is in a block of cells (see `course_tree` for the groups, `kernels`
+and `offset_bound` for the bounds); both are halved from level to level. A beam of promising nodes finds a good incumbent
+first; then every level is bounded, pruned and split. What was pruned is bounded too: `missed_mass` says how much
+posterior it could hold at most. The work is limited by a budget, counted and not timed, and by the caller's patience:
+where either ends first, fewer nodes are followed, the others but bounded.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,50 +14,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Fault, InvalidInput
 from app.geometry import Array
-from app.positioning.floors import TOP_LEVEL, Plane
-from app.positioning.kernels import block_bounds, pose_costs
+from app.positioning.course_tree import CourseTree, course_tree
+from app.positioning.descent import bound_nodes, dive, sift, split_nodes, top_nodes
+from app.positioning.floors import Plane
+from app.positioning.kernels import Scene
 from app.positioning.lattice import Courses, ReducedWindow, turn_window
+from app.positioning.pose_prior import PosePrior
+from app.positioning.scene import make_scene, telling_order
 from app.positioning.window_error import WindowError
 
 __all__ = ["CAPACITY", "Candidates", "PosePrior", "search"]
 
-Blocks = NDArray[np.int32]
+Nodes = NDArray[np.int32]
 CAPACITY = 400_000  # poses kept at most
-LEAST_PRIOR_SD_M = 1e-3
-BUDGET = 4_000_000_000  # values compared per plane at most: poses or blocks, times samples, times components
-_OFFSET_BOUND_WORK = 2  # a bound over all offsets costs as much as so many plain ones
-_TOP_SHARE = 0.25  # of the budget, for the blocks the search starts from
-_BLOCKS_PER_POSE = 2  # how many blocks of a level may be followed, per pose of the capacity
-_BEAM = 48
-_OFFSET_TOP_LEVEL = 4  # larger blocks than this an offset nearly always explains
-_DIVE_AGAIN = 1500  # blocks of one level: so many mean the incumbent is poor
+BUDGET = 4_000_000_000  # values compared per plane at most: poses or nodes, times samples, times components
+_TOP_SHARE = 0.25  # of the budget, for the nodes the search starts from
+_NODES_PER_POSE = 2  # how many nodes of a level may be followed, per pose of the capacity
+_TOP, _OFFSET_TOP = 5, 4  # levels to start from: what larger blocks hold is hardly ever excluded
+_SHARE = 1.0  # of a block's side, by which a group of courses may spread the samples
+_BEAM = 16
+_DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
-_SPARE_NATS = 12.0  # how far beyond the limit a bound is followed, so that the missed mass comes out small
-_CHUNK = 20_000  # blocks bounded between two looks at the caller's patience
-
-
-@dataclass(frozen=True, slots=True)
-class PosePrior:
-    """Gaussian prior of the last sample's position, metres; no position: flat.
-
-    walkable: per plane (ny, nx), the cells the last sample may be in, or None for all
-
-    Raises InvalidInput for an sd below a millimetre.
-    """
-
-    position_m: tuple[float, float, float] | None = None
-    sd_m: float = 1.0
-    walkable: Sequence[NDArray[np.bool_]] | None = None
-
-    def __post_init__(self) -> None:
-        if not self.sd_m >= LEAST_PRIOR_SD_M:
-            raise InvalidInput(
-                f"the prior's sd_m is {self.sd_m:g}: no position is known that well; give at least "
-                f"{LEAST_PRIOR_SD_M:g} m",
-                Fault("/prior/sd_m", f"must be at least {LEAST_PRIOR_SD_M:g}"),
-            )
+_CHUNK = 4_000  # nodes split between two looks at the caller's patience
+_ENDLESS = 1 << 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,111 +64,74 @@ class Candidates:
 
     def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "Candidates":
         """Some of the poses, by index or mask."""
-        parts = (self.plane, self.course, self.row, self.column, self.score)
-        plane, course, row, column, score = (part[chosen] for part in parts)
-        return replace(self, plane=plane, course=course, row=row, column=column, score=score)
+        plane, course, row, column = (each[chosen] for each in (self.plane, self.course, self.row, self.column))
+        return replace(self, plane=plane, course=course, row=row, column=column, score=self.score[chosen])
 
 
-class _PlaneCosts:
-    """Costs and bounds on one plane; `constant` turns a cost into -2 score, comparable between planes."""
+class _OnPlane:
+    """The tree over one plane."""
 
-    def __init__(
-        self,
-        plane: Plane,
-        window: ReducedWindow,
-        courses: Courses,
-        prior: PosePrior,
-        error: WindowError,
-        walkable: NDArray[np.bool_] | None,
-    ) -> None:
-        turned = turn_window(window, courses, plane.resolution_m)
-        order = telling_order(window, plane)
-        self.plane, self.courses = plane, len(courses)
-        self.table = None if walkable is None else _summed(walkable)
-        precision = error.offset_precision
-        self.has_offset = precision is not None
-        self.top = _OFFSET_TOP_LEVEL if self.has_offset else TOP_LEVEL
-        self.compared: int = window.features_uT.size  # values per pose
-        while self.top < TOP_LEVEL and self.work(self.top, len(self.top_blocks())) > _TOP_SHARE * BUDGET:
-            self.top += 1
-        self.z = np.ascontiguousarray(turned.features_uT[:, order])
-        self.row = np.ascontiguousarray(turned.offset_cells[:, order, 0])
-        self.column = np.ascontiguousarray(turned.offset_cells[:, order, 1])
-        self.turn = np.ascontiguousarray(turned.turn[:, order])
-        self.tilt = np.ascontiguousarray(window.tilt[order]) if len(window.tilt) else window.tilt
-        self.inflation = error.inflation * error.own_share
-        self.noise = window.noise_variance_uT2[order] / error.own_share
-        noises, self.kind = np.unique(self.noise, return_inverse=True)
-        ladder = plane.pyramid.ladder_uT2[None] + noises[:, None]
-        n, c = window.features_uT.shape
-        self.ladder = np.stack([self.inflation * ladder, c * np.log(ladder / ladder[:, :1])], axis=-1)
-        self.least = float(plane.pyramid.ladder_uT2[0])
-        self.course_cost = -2.0 * courses.log_prior
-        self.prior, height = _prior_in_cells(plane, prior)
-        floor = self.inflation * (self.least + self.noise)
-        self.constant = c * float(np.log(2 * np.pi * floor).sum()) + height
-        worth = n * c / error.inflation
-        self.expected = self.constant + worth + 5.0 * (2.0 * worth) ** 0.5  # cost of a pose that matches
-        weight = float(np.sum(1.0 / floor)) + (precision or 0.0)
-        lightest = float(np.sum(1.0 / self.ladder[self.kind, -1, 0])) + (precision or 0.0)
-        self.offset = (float(self.has_offset), precision or 0.0, weight, c * float(np.log(lightest / weight)))
-        if precision is not None:  # one Gaussian factor per component is integrated out
-            self.constant += c * float(np.log(weight / (precision or 2.0 * np.pi)))
+    def __init__(self, scene: Scene, tree: CourseTree, compared: int, top: int) -> None:
+        self.scene, self.courses, self.compared, self.top = scene, tree, compared, top
+        self.tree = tree.tree
+        self.ny, self.nx = scene.mean.shape[0] - 2, scene.mean.shape[1] - 2
 
-    def costs(self, poses: Blocks, stop: float) -> Array:
-        p = self.plane
-        costs: Array = pose_costs(
-            poses, self.offset, self.z, self.row, self.column, self.turn, self.tilt, self.noise, self.least,
-            self.inflation, p.mean_uT, p.variance_uT2, self.course_cost, self.prior, stop - self.constant,
-        )  # fmt: skip
-        return costs + self.constant
+    def top_nodes(self) -> tuple[Nodes, Array]:
+        stage, side = self.courses.stages[self.top], 1 << self.top
+        middle = self.tree.middle[stage.first : stage.last]
+        row, column = (int(middle[:, k].min()) // side * side for k in (0, 2))
+        height = (self.ny - 1 + int(middle[:, 1].max()) - row) // side + 1
+        width = (self.nx - 1 + int(middle[:, 3].max()) - column) // side + 1
+        nodes: Nodes
+        costs: Array
+        nodes, costs = top_nodes(stage.first, stage.last, self.top, row, column, height, width, self.tree, self.scene)
+        return nodes, costs
 
-    def bounds(self, blocks: Blocks, level: int, stop: float) -> Array:
-        squares = self.plane.pyramid.levels[level - 1]
-        height, width, size = squares.records.shape
-        records = squares.records.reshape(-1, size)
-        place = (squares.base, squares.step.bit_length() - 1, height, width)
-        bounds: Array = block_bounds(
-            blocks, squares.side, self.offset, self.z, self.row, self.column, self.turn, self.tilt, self.kind,
-            self.ladder, place, records, records.view(np.uint8), self.course_cost, self.prior, stop - self.constant,
-        )  # fmt: skip
-        return bounds + self.constant
+    def split(self, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array, Array]:
+        """The parts of nodes one level down, their prior costs, and the bounds of what they are parts of."""
+        parts: Nodes
+        costs: Array
+        known: Array
+        parts, costs, known = split_nodes(nodes, bounds, level, self.tree, self.scene)
+        return parts, costs, known
 
-    def work(self, level: int, count: int) -> int:
-        """What so many poses (level 0) or blocks cost of the budget, at most."""
-        return count * self.compared * (_OFFSET_BOUND_WORK if self.has_offset and level else 1)
+    def bound(
+        self, nodes: Nodes, costs: Array, level: int, best: float, window: float, allowed: int
+    ) -> tuple[int, int]:
+        """Turn prior costs into bounds, of as many nodes as allowed; returns how many, and the values compared."""
+        done, used = bound_nodes(nodes, costs, level, self.tree, self.scene, best, window, allowed // self.compared)
+        return int(done), int(used) * self.compared
 
-    def top_blocks(self) -> Blocks:
-        ny, nx = self.plane.shape
-        side = 1 << self.top
-        h, j, i = np.meshgrid(np.arange(self.courses), np.arange(0, ny, side), np.arange(0, nx, side), indexing="ij")
-        blocks = np.stack([h.ravel(), j.ravel(), i.ravel()], axis=1).astype(np.int32)
-        return blocks if self.table is None else blocks[self.walkable_blocks(blocks, self.top)]
+    def dive(self, nodes: Nodes, bounds: Array, level: int, best: float) -> tuple[Nodes, float]:
+        """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds one."""
+        beam = _BEAM
+        while True:
+            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, best)
+            if len(pose) or beam >= len(nodes):
+                return pose, float(cost)
+            beam *= 8
 
-    def walkable_blocks(self, blocks: Blocks, level: int) -> NDArray[np.bool_]:
-        """Which blocks hold a cell the last sample may be in."""
-        assert self.table is not None
-        (ny, nx), side = self.plane.shape, 1 << level
-        j, i = np.minimum(blocks[:, 1], ny), np.minimum(blocks[:, 2], nx)
-        below, right = np.minimum(j + side, ny), np.minimum(i + side, nx)
-        held = self.table[below, right] - self.table[j, right] - self.table[below, i] + self.table[j, i]
-        return np.asarray(held > 0)
+    def most(self, nodes: Nodes) -> int:
+        """Values compared at most to split nodes."""
+        g = nodes[:, 0]
+        parts = int(np.maximum(self.tree.first[g + 1] - self.tree.first[g], 1).sum())
+        return 4 * parts * self.compared * self.tree.feature.shape[1]
 
-    def split(self, blocks: Blocks, level: int, bounds: Array) -> tuple[Blocks, Array]:
-        """The blocks of half the side that have walkable cells on the grid, each with its parent's bound."""
-        ny, nx = self.plane.shape
-        half = 1 << (level - 1)
-        corners = np.array([[0, 0, 0], [0, 0, half], [0, half, 0], [0, half, half]], dtype=np.int32)
-        children = (blocks[:, None, :] + corners).reshape(-1, 3)
-        inside = (children[:, 1] < ny) & (children[:, 2] < nx)
-        if self.table is not None:
-            inside &= self.walkable_blocks(children, level - 1)
-        return children[inside], np.repeat(bounds, 4)[inside]
+    def sift(self, nodes: Nodes, bounds: Array, level: int, best: float, window: float) -> tuple[Nodes, Array, float]:
+        """The nodes that may matter, and the mass, relative to a pose of cost `best`, of the others at most."""
+        left: Nodes
+        least: Array
+        left, least, missed = sift(nodes, bounds, level, self.tree, self.scene, best, window)
+        return left, least, float(missed)
 
-    def cells(self, blocks: Blocks, level: int) -> Array:
-        ny, nx = self.plane.shape
+    def poses(self, nodes: Nodes, level: int) -> Array:
+        """How many poses nodes hold at most."""
         side = 1 << level
-        return np.minimum(side, ny - blocks[:, 1]) * np.minimum(side, nx - blocks[:, 2]).astype(np.float64)
+        return self.tree.leaves[nodes[:, 0]] * float(min(side, self.ny) * min(side, self.nx))
+
+    def last_cells(self, poses: Nodes) -> Nodes:
+        """(course, row, column) of the last sample."""
+        return poses - np.pad(self.tree.middle[poses[:, 0]][:, (0, 2)], ((0, 0), (1, 0)))
 
 
 def search(
@@ -207,25 +151,23 @@ def search(
     At most `capacity` poses are kept, `budget` values compared on each plane, and no more looked at once `out_of_time`
     says so; what that leaves out is counted in `missed_mass`, and `complete` says so.
     """
-    walkable = prior.walkable or [None] * len(planes)
-    costs = [
-        _PlaneCosts(plane, window, courses, prior, error, mask) for plane, mask in zip(planes, walkable, strict=True)
-    ]
-    expected = max(on_plane.expected for on_plane in costs) + 2.0 * (window_nats + _SPARE_NATS)
-    patience = _Patience(out_of_time)
-    starts = [_start(on_plane, expected, patience) for on_plane in costs]
-    seeds = [start.seed_cost for start in starts]
-    sweep = _Sweep(min(seeds), 2.0 * window_nats, capacity // len(planes), budget, patience)
-    found: list[tuple[Blocks, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(planes)
-    for k in np.argsort(seeds, kind="stable"):  # the best incumbent first
-        found[k] = sweep.run(costs[k], starts[k])
+    on_planes, expected = _on_planes(planes, window, courses, prior, error, budget)
+    sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget, _Patience(out_of_time))
+    starts = [sweep.start(on_plane, expected) for on_plane in on_planes]
+    ranks = np.argsort([start.least for start in starts], kind="stable")
+    for k in ranks:  # the most promising first, until a pose is as good as one that matches
+        if sweep.best > expected:
+            sweep.seed(on_planes[k], starts[k])
+    found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(planes)
+    for k in ranks:
+        found[k] = sweep.run(on_planes[k], starts[k])
     plane = np.concatenate([np.full(len(poses), k) for k, (poses, _) in enumerate(found)])
-    poses = np.concatenate([poses for poses, _ in found]).astype(np.int64)
+    poses = np.concatenate([on_planes[k].last_cells(poses) for k, (poses, _) in enumerate(found)]).astype(np.int64)
     cost = np.concatenate([cost for _, cost in found])
     inside = cost <= sweep.best + sweep.window
     order = np.flatnonzero(inside)
     order = order[np.lexsort((poses[order, 2], poses[order, 1], poses[order, 0], plane[order], cost[order]))]
-    sweep.miss_poses(cost[~inside])
+    sweep.miss(np.ones(len(cost) - len(order)), cost[~inside])
     return Candidates(
         plane=plane[order],
         course=poses[order, 0],
@@ -233,10 +175,46 @@ def search(
         column=poses[order, 2],
         score=-0.5 * cost[order],
         window_nats=0.5 * sweep.window,
-        complete=sweep.window == 2.0 * window_nats and not patience.ended,
+        complete=sweep.window == 2.0 * window_nats and not sweep.patience.ended,
         missed_mass=sweep.missed_mass,
         poses=len(courses) * sum(p.shape[0] * p.shape[1] for p in planes),
     )
+
+
+def _on_planes(
+    planes: Sequence[Plane], window: ReducedWindow, courses: Courses, prior: PosePrior, error: WindowError, budget: int
+) -> tuple[list[_OnPlane], float]:
+    """The planes with the trees over them, one tree for all of a resolution; and the cost of a pose that matches."""
+    order = telling_order(window, planes[0])
+    along = np.abs(window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1]))
+    trees: dict[float, CourseTree] = {}
+    on_planes, expected = [], -np.inf
+    for plane, walkable in zip(planes, prior.walkable or [None] * len(planes), strict=True):
+        scene, usual = make_scene(plane, window, order, prior, error, walkable)
+        if plane.resolution_m not in trees:
+            steep = max(p.gradient_uT_per_m for p in planes) * plane.resolution_m
+            trees[plane.resolution_m] = course_tree(
+                courses, turn_window(window, courses, plane.resolution_m), order, int(np.argmin(along)),
+                plane.pyramid.places, len(plane.pyramid.levels), 1.0 / max(steep, 1e-3),
+                _SHARE, scene.headed,
+            )  # fmt: skip
+        tree = trees[plane.resolution_m]
+        on_planes.append(_OnPlane(scene, tree, window.features_uT.shape[1], _top(plane, window, tree, error, budget)))
+        expected = max(expected, usual)
+    return on_planes, expected
+
+
+def _top(plane: Plane, window: ReducedWindow, tree: CourseTree, error: WindowError, budget: int) -> int:
+    """The level to start from: larger blocks where the budget does not allow more."""
+    ny, nx = plane.shape
+    level = min(_TOP if error.offset_precision is None else _OFFSET_TOP, len(tree.stages) - 1)
+    while level < len(tree.stages) - 1:
+        stage = tree.stages[level]
+        blocks = ((ny >> level) + 2) * ((nx >> level) + 2)
+        if (stage.last - stage.first) * blocks * window.features_uT.size <= _TOP_SHARE * budget:
+            break
+        level += 1
+    return level
 
 
 class _Patience:
@@ -250,80 +228,136 @@ class _Patience:
         self.ended = self.ended or (self._out_of_time is not None and self._out_of_time())
         return self.ended
 
-    def bounds(self, on_plane: _PlaneCosts, blocks: Blocks, level: int, stop: float, known: Array) -> Array:
-        """Bounds of blocks, those that are reached in time; of the others what is `known` (their parents')."""
-        found = known
-        for start in range(0, len(blocks), _CHUNK):
-            if self.over():
-                break
-            part = slice(start, start + _CHUNK)
-            found[part] = on_plane.bounds(blocks[part], level, stop)
-        return found
+
+@dataclass(slots=True, eq=False)
+class _Start:
+    """The top nodes of a plane, what their priors cost, and their bounds, followed up to `followed_to`; a pose (1, 3)
+    that was found, or none."""
+
+    nodes: Nodes
+    prior_costs: Array
+    bounds: Array
+    followed_to: float
+    used: int
+    seed: Nodes
+    seed_cost: float
+
+    @property
+    def least(self) -> float:
+        return float(self.bounds.min()) if len(self.bounds) else np.inf
 
 
 class _Sweep:
     """Level by level over one plane after the other; the incumbent and the window carry over."""
 
-    def __init__(self, best: float, window: float, capacity: int, budget: int, patience: _Patience) -> None:
-        self.best, self.window, self.capacity = best, window, max(capacity, 1)
+    def __init__(self, window: float, capacity: int, budget: int, patience: _Patience) -> None:
+        self.best, self.window, self.capacity = np.inf, window, max(capacity, 1)
         self.budget, self.patience = budget, patience
         self.missed_mass = 0.0  # at most, relative to the best pose
 
-    def run(self, on_plane: _PlaneCosts, start: "_Start") -> tuple[Blocks, Array]:
+    def start(self, on_plane: _OnPlane, expected: float) -> _Start:
+        """Bound the top nodes as far as a matching window needs it."""
+        nodes, costs = on_plane.top_nodes()
+        bounds = costs.copy()
+        used = self._bound(on_plane, nodes, bounds, expected)
+        return _Start(nodes, costs, bounds, expected, used, np.empty((0, 3), np.int32), np.inf)
+
+    def seed(self, on_plane: _OnPlane, start: _Start) -> None:
+        """Follow the most promising top nodes of a plane down to a pose."""
+        if len(start.nodes):
+            start.seed, start.seed_cost = on_plane.dive(start.nodes, start.bounds, on_plane.top, np.inf)
+            self._improve(start.seed_cost)
+
+    def run(self, on_plane: _OnPlane, start: _Start) -> tuple[Nodes, Array]:
         """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
-        blocks, bounds, seed, seed_cost = start.blocks, start.bounds, start.seed, start.seed_cost
-        if not len(blocks):
-            return blocks, bounds
-        if self._stop() > start.followed_to:
-            again = bounds <= self._stop()
-            bounds[again] = self.patience.bounds(on_plane, blocks[again], on_plane.top, self._stop(), bounds[again])
-        left = self.budget - on_plane.work(on_plane.top, len(blocks))
-        for level in range(on_plane.top, 0, -1):
-            if level < on_plane.top:
-                bounds = self.patience.bounds(on_plane, blocks, level, self._stop(), bounds)
-            if level < on_plane.top and len(blocks) > _DIVE_AGAIN:
-                pose, cost = _dive(on_plane, blocks, bounds, level)
-                seed, seed_cost = (pose, cost) if cost < seed_cost else (seed, seed_cost)
-                self._improve(cost)
-            if self.patience.over():
-                left = 0
-            affordable = left // (level * on_plane.work(level - 1, 4))  # an even share for every level still to come
-            keep = self._keep(bounds, max(min(_BLOCKS_PER_POSE * self.capacity, affordable), 1))
-            self.miss(on_plane, blocks, bounds, ~keep, level)
-            blocks, bounds = on_plane.split(blocks[keep], level, bounds[keep])
-            left -= on_plane.work(level - 1, len(blocks))
-        seeded = np.flatnonzero((blocks == seed).all(axis=1))
-        blocks = np.concatenate([seed, np.delete(blocks, seeded, axis=0)])
-        costs = on_plane.costs(blocks, self._stop())
-        costs[0] = seed_cost
+        nodes, bounds, left = start.nodes, start.bounds, self.budget - start.used
+        if self.best > start.followed_to:
+            bounds = start.prior_costs.copy()
+            left -= self._bound(on_plane, nodes, bounds, self.best)
+        for level in range(on_plane.top - 1, -1, -1):
+            nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
+            if len(nodes) > _DIVE_AGAIN:
+                pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best)
+                if cost < start.seed_cost:
+                    start.seed, start.seed_cost = pose, cost
+                    self._improve(cost)
+            nodes, bounds, used = self._split(on_plane, nodes, bounds, level, left // (level + 1))
+            left -= used
+        return self._poses(nodes, bounds, start)
+
+    def miss(self, poses: Array, bounds: Array) -> None:
+        """Count nodes of so many poses that are left out, by their bounds."""
+        near = bounds < self.best + 2.0 * _NEGLIGIBLE_NATS
+        self.missed_mass += float(poses[near] @ np.exp(np.minimum(0.5 * (self.best - bounds[near]), 300.0)))
+
+    def _poses(self, nodes: Nodes, costs: Array, start: _Start) -> tuple[Nodes, Array]:
+        """What is left at the end, and the seed."""
+        seeded = (nodes == start.seed).all(axis=1) if len(start.seed) else np.zeros(len(nodes), dtype=np.bool_)
+        if len(start.seed) and not seeded.any():
+            nodes, costs = np.concatenate([start.seed, nodes]), np.append(start.seed_cost, costs)
+        if not len(nodes):
+            return nodes, costs
         self._improve(float(costs.min()))
         keep = self._keep(costs, self.capacity)
-        keep[np.argmin(costs)] = True
-        self.miss(on_plane, blocks, costs, ~keep, 0)
-        return blocks[keep], costs[keep]
+        self.miss(np.ones(len(costs) - int(keep.sum())), costs[~keep])
+        return nodes[keep], costs[keep]
 
-    def miss(
-        self, on_plane: _PlaneCosts, blocks: Blocks, bounds: Array, left_out: NDArray[np.bool_], level: int
-    ) -> None:
-        """Count blocks that are left out, by their bounds."""
-        near = np.flatnonzero(left_out & (bounds < self.best + 2.0 * _NEGLIGIBLE_NATS))
-        self.missed_mass += float(np.sum(on_plane.cells(blocks[near], level) * self._mass(bounds[near])))
+    def _bound(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, best: float) -> int:
+        """Bound top nodes, those that are reached in time; returns the values compared."""
+        used = 0
+        for first in range(0, len(nodes), 8 * _CHUNK):
+            if self.patience.over():
+                break
+            part = slice(first, first + 8 * _CHUNK)
+            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, best, self.window, _ENDLESS)[1]
+        return used
 
-    def miss_poses(self, costs: Array) -> None:
-        """Count poses that are left out in the end."""
-        self.missed_mass += float(np.sum(self._mass(costs)))
+    def _split(
+        self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int, allowed: int
+    ) -> tuple[Nodes, Array, int]:
+        """The parts of nodes that are worth following, their bounds, and the values compared, hardly more than allowed.
+
+        What is not reached, by the budget or in time, is left out, the least promising first.
+        """
+        if on_plane.most(nodes) > allowed:
+            order = np.argsort(bounds, kind="stable")
+            nodes, bounds = nodes[order], bounds[order]
+        found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))]
+        done = used = 0
+        while done < len(nodes) and used < allowed and not self.patience.over():
+            part = slice(done, done + _CHUNK)
+            parts, costs, known = on_plane.split(nodes[part], bounds[part], level)
+            reached, compared = on_plane.bound(parts, costs, level, self.best, self.window, allowed - used)
+            if reached < len(parts):
+                self._leave(on_plane, parts[reached:], known[reached:], level)
+            *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best, self.window)
+            found.append((kept[0], kept[1]))
+            done, used, self.missed_mass = done + _CHUNK, used + compared, self.missed_mass + missed
+        if done < len(nodes):
+            self._leave(on_plane, nodes[done:], bounds[done:], level + 1)
+        if len(found) == 2:
+            return *found[1], used
+        return np.concatenate([parts for parts, _ in found]), np.concatenate([costs for _, costs in found]), used
+
+    def _leave(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> None:
+        """Leave out nodes that were not reached: the window ends where they may begin."""
+        self.miss(on_plane.poses(nodes, level), bounds)
+        self.window = min(self.window, max(float(bounds.min()) - self.best, 0.0))
+
+    def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
+        """Those within the window; it shrinks when they are more than there is room for."""
+        nodes, bounds, missed = on_plane.sift(nodes, bounds, level, self.best, self.window)
+        self.missed_mass += missed
+        if len(nodes) > _NODES_PER_POSE * self.capacity:
+            keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
+            self.miss(on_plane.poses(nodes[~keep], level), bounds[~keep])
+            nodes, bounds = nodes[keep], bounds[keep]
+        return nodes, bounds
 
     def _improve(self, cost: float) -> None:
         if cost < self.best:
             self.missed_mass *= float(np.exp(0.5 * (cost - self.best)))
             self.best = cost
-
-    def _mass(self, costs: Array) -> Array:
-        """Posterior mass relative to the best pose so far."""
-        return np.asarray(np.exp(np.minimum(0.5 * (self.best - costs), 300.0)))
-
-    def _stop(self) -> float:
-        return self.best + self.window + 2.0 * _SPARE_NATS
 
     def _keep(self, bounds: Array, room: int) -> NDArray[np.bool_]:
         """Which to follow: those within the window, which shrinks when they are more than there is room for."""
@@ -337,75 +371,3 @@ class _Sweep:
         keep[:] = False
         keep[chosen] = True
         return keep
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """The top blocks with their bounds, followed up to `followed_to`, and a good pose (1, 3) as first incumbent."""
-
-    blocks: Blocks
-    bounds: Array
-    followed_to: float
-    seed: Blocks
-    seed_cost: float
-
-
-def _start(on_plane: _PlaneCosts, expected: float, patience: _Patience) -> _Start:
-    """Bound the top blocks as far as a matching window needs it, and follow the most promising down to a pose."""
-    top = on_plane.top_blocks()
-    if not len(top):  # nowhere to walk on this plane
-        return _Start(top, np.empty(0), expected, top, np.inf)
-    known = np.full(len(top), on_plane.constant + float(on_plane.course_cost.min()))
-    bounds = patience.bounds(on_plane, top, on_plane.top, expected, known)
-    seed, seed_cost = _dive(on_plane, top, bounds, on_plane.top)
-    return _Start(top, bounds, expected, seed, seed_cost)
-
-
-def _dive(on_plane: _PlaneCosts, blocks: Blocks, bounds: Array, level: int) -> tuple[Blocks, float]:
-    """Follow the most promising blocks of a level down to a pose (1, 3) and its cost."""
-    while level > 0:
-        if len(blocks) > _BEAM:
-            chosen = np.argpartition(bounds, _BEAM)[:_BEAM]
-            blocks, bounds = blocks[chosen], bounds[chosen]
-        blocks, bounds = on_plane.split(blocks, level, bounds)
-        level -= 1
-        bounds = on_plane.bounds(blocks, level, np.inf) if level else on_plane.costs(blocks, np.inf)
-    best = int(np.argmin(bounds))
-    return blocks[best : best + 1], float(bounds[best])
-
-
-def _summed(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(ny + 1, nx + 1) summed-area table."""
-    table = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), dtype=np.int64)
-    table[1:, 1:] = mask.cumsum(axis=0).cumsum(axis=1)
-    return table
-
-
-def _prior_in_cells(plane: Plane, prior: PosePrior) -> tuple[Array, float]:
-    """(row, column, cost per squared cell) of the position prior on a plane and the cost of the plane's height."""
-    if prior.position_m is None:
-        return np.zeros(3), 0.0
-    x, y, z = prior.position_m
-    weight = 1.0 / prior.sd_m**2
-    row, column = (y - plane.origin_m[1]) / plane.resolution_m, (x - plane.origin_m[0]) / plane.resolution_m
-    height = weight * (z - plane.height_m) ** 2
-    return np.array([row, column, weight * plane.resolution_m**2]), float(height)
-
-
-def telling_order(window: ReducedWindow, plane: Plane) -> NDArray[np.int64]:
-    """The samples, the most telling first: unlike the ambient field, and far from those already taken."""
-    strength, usual = window.features_uT, plane.ambient_uT
-    if window.turns:
-        strength = np.column_stack([np.hypot(strength[:, 0], strength[:, 1]), strength[:, 2]])
-        usual = np.array([np.hypot(usual[0], usual[1]), usual[2]])
-    unusual = np.linalg.norm(strength - usual, axis=1)
-    unusual /= max(float(unusual.max()), 1e-9)
-    order = [int(np.argmax(unusual))]
-    distance = np.full(len(window), np.inf)
-    for _ in range(len(window) - 1):
-        latest = window.from_last_m[order[-1]]
-        distance = np.minimum(distance, np.linalg.norm(window.from_last_m - latest, axis=1))
-        merit = np.minimum(distance, 4.0) / 4.0 + 0.5 * unusual
-        merit[order] = -1.0
-        order.append(int(np.argmax(merit)))
-    return np.array(order)

@@ -54,7 +54,7 @@ def exhaustive_scores(
                 else window.features_uT[k] - mean
             )
             if len(plane.scale) == 3:
-                r = (r @ yaw_matrix(yaw + window.yaw_rad[k])) @ (window.tilt[k].T if len(window.tilt) else np.eye(3))
+                r = (r @ yaw_matrix((courses.heading_rad[h] if window.turns else 0.0) + window.yaw_rad[k])) @ (window.tilt[k].T if len(window.tilt) else np.eye(3))
             residuals.append(r)
             variances.append(error.inflation * (error.own_share * variance + window.noise_variance_uT2[k]))
         r, v = np.array(residuals), np.array(variances)[..., None]
