@@ -116,14 +116,18 @@ def course_tree(
             part, counted = _nest(counts, shifts[l - 1], shifts[l])
             first[start + 1 : start + size + 1] = first[start] + np.cumsum(counted)
             parts.append((part + below.first).astype(np.int32))
-            _join(start, first[start : start + size + 1] - first[start], parts[-1], extent, feature, middle, cost, leaves)
+            _join(
+                start, first[start : start + size + 1] - first[start], parts[-1], extent, feature, middle, cost, leaves
+            )
             heading[start : start + size] = heading[parts[-1][first[start : start + size] - first[start]]]
             _choose_level(extent[start : start + size], l, places, level[start : start + size])
         stages.append(stage)
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
     part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
-    return CourseTree(Tree(place, feature, exact, middle, heading, cost, leaves, 2.0 * np.log(leaves), first, part), tuple(stages))
+    return CourseTree(
+        Tree(place, feature, exact, middle, heading, cost, leaves, 2.0 * np.log(leaves), first, part), tuple(stages)
+    )
 
 
 def _counts(courses: Courses) -> tuple[int, int, int]:
@@ -155,7 +159,9 @@ def _spread_per_step(turned: Turned, middle: int, counts: tuple[int, int, int], 
     for axis in range(3):
         if counts[axis] < 2:
             continue
-        along = tuple(slice(None) if k == axis else slice(None, None, max(count // 3, 1)) for k, count in enumerate(counts))
+        along = tuple(
+            slice(None) if k == axis else slice(None, None, max(count // 3, 1)) for k, count in enumerate(counts)
+        )
         moved = np.diff(offset[along], axis=axis).astype(np.float64)
         turns = np.diff(feature[along], axis=axis) * cells_per_uT
         spread[axis] = np.sqrt(np.mean(np.square(moved).sum(axis=-1)) + np.mean(np.square(turns).sum(axis=-1)))
@@ -225,7 +231,10 @@ def _join(start, first, part, extent, feature, middle, cost, leaves):  # type: i
             p = part[b]
             cost[g], leaves[g] = min(cost[g], cost[p]), leaves[g] + leaves[p]
             for x in (0, 2):
-                middle[g, x], middle[g, x + 1] = min(middle[g, x], middle[p, x]), max(middle[g, x + 1], middle[p, x + 1])
+                middle[g, x], middle[g, x + 1] = (
+                    min(middle[g, x], middle[p, x]),
+                    max(middle[g, x + 1], middle[p, x + 1]),
+                )
             for k in range(n):
                 for x in (0, 2):
                     extent[g, k, x] = min(extent[g, k, x], extent[p, k, x])

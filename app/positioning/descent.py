@@ -22,7 +22,12 @@ def _prior_cost(g, j, i, side, ny, nx, middle, walkable, prior):  # type: ignore
     if top > bottom or left > right:
         return -1.0
     if len(walkable):
-        held = walkable[bottom + 1, right + 1] - walkable[top, right + 1] - walkable[bottom + 1, left] + walkable[top, left]
+        held = (
+            walkable[bottom + 1, right + 1]
+            - walkable[top, right + 1]
+            - walkable[bottom + 1, left]
+            + walkable[top, left]
+        )
         if held == 0:
             return -1.0
     dj = max(max(top - prior[0], prior[0] - bottom), 0.0)

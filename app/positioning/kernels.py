@@ -21,7 +21,18 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 
-__all__ = ["NOTHING", "ROUNDING", "SLACK", "Scene", "limit_of", "plain_bounds", "pose_costs", "record_of", "spare_cost", "to_sensor"]
+__all__ = [
+    "NOTHING",
+    "ROUNDING",
+    "SLACK",
+    "Scene",
+    "limit_of",
+    "plain_bounds",
+    "pose_costs",
+    "record_of",
+    "spare_cost",
+    "to_sensor",
+]
 
 SLACK = 2e-6  # relative: what rounding to single precision may add to the terms of a bound
 ROUNDING = 1e-9  # relative: what rounding to double precision may add to a bound

@@ -23,7 +23,6 @@ from app.positioning.matching import Matched
 __all__ = ["Evidence", "OffMap", "ProcessPrior", "off_map", "process_evidence", "process_prior"]
 
 OFF_MAP_PRIOR = 0.4  # how likely, before the window is looked at, it was walked where nothing is mapped
-_MOST_CELLS = 40_000  # enough of a map to know how steep it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,17 +119,7 @@ def process_prior(plane: Plane, variance_uT2: Array) -> ProcessPrior:
     A Matern 3/2 field of variance s^2 has a mean squared gradient of 6 s^2 / length^2 over the plane. A flat map, or
     one of scattered cells, leaves the length scale at that of the whole plane.
     """
-    stride = max(1, int(np.sqrt(plane.measured.size / _MOST_CELLS)))
-    mean, measured = plane.mean_uT[1:-1, 1:-1].astype(np.float64), plane.measured
-    squared = 0.0
-    for axis in (0, 1):
-        here, there = (slice(None), slice(-1)), (slice(None), slice(1, None))
-        one, next_one = (here, there) if axis else (here[::-1], there[::-1])
-        both = measured[one] & measured[next_one]
-        both[np.arange(len(both)) % stride != 0] = False
-        if both.any():
-            squared += float(np.mean(np.sum(np.square(mean[next_one][both] - mean[one][both]), axis=1)))
     widest = plane.resolution_m * max(plane.shape)
-    steepness = np.sqrt(squared) / plane.resolution_m
     steepest = np.sqrt(6.0 * float(variance_uT2.sum()))
-    return ProcessPrior(variance_uT2, float(np.clip(steepest / max(steepness, 1e-9), plane.resolution_m, widest)))
+    length_m = steepest / max(plane.gradient_uT_per_m, 1e-9)
+    return ProcessPrior(variance_uT2, float(np.clip(length_m, plane.resolution_m, widest)))

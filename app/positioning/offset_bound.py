@@ -65,7 +65,25 @@ def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _offset_bound(  # type: ignore[no-untyped-def]
-    g, j, i, level, place, feature, heading, kind, ladder, records, codes, places, turn, headed, offset, cost, stop, box, weight
+    g,
+    j,
+    i,
+    level,
+    place,
+    feature,
+    heading,
+    kind,
+    ladder,
+    records,
+    codes,
+    places,
+    turn,
+    headed,
+    offset,
+    cost,
+    stop,
+    box,
+    weight,
 ):
     """`cost` plus the bound of the block at (j, i), given up as soon as it exceeds `stop`; and the samples compared.
 
@@ -127,9 +145,7 @@ def _offset_bound(  # type: ignore[no-untyped-def]
             x, y, z = to_sensor(ex, ey, ez, turn, k)
             sx, sy, sz = sx + w * x, sy + w * y, sz + w * z
         work += n
-        bound = _dual(
-            precision, bx, by, bz, squares, sx, sy, sz, total - precision, ch, sh, box, weight, turn, n
-        )
+        bound = _dual(precision, bx, by, bz, squares, sx, sy, sz, total - precision, ch, sh, box, weight, turn, n)
         best = max(best, bound)
         if best > room or squares + precision * (bx * bx + by * by + bz * bz) <= room:
             break

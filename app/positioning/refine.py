@@ -18,9 +18,11 @@ from app.positioning.lattice import ReducedWindow, bent_m
 from app.positioning.scoring import sensor_residual
 from app.positioning.window_error import WindowError
 
-__all__ = ["PoseGaussian", "Refined", "pose_fit", "refine_poses"]
+__all__ = ["PoseGaussian", "Refined", "refine_poses"]
 
 _STEPS = 12
+_FIRST_STEPS, _HOPEFUL_NATS = 2, 20.0  # after a few steps only poses that may still be among the best go on
+_STILL_M = 1e-3
 POSE = 5
 
 
@@ -74,11 +76,20 @@ class _Linearised:
     variance: Array
     bias: Array
 
+    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> "_Linearised":
+        return _Linearised(*(getattr(self, name)[chosen] for name in self.__slots__))
+
+    def put(self, chosen: NDArray[np.int64], values: "_Linearised") -> None:
+        for name in self.__slots__:
+            getattr(self, name)[chosen] = getattr(values, name)
+
 
 def refine_poses(
     floor: SearchableFloor, plane: Plane, window: ReducedWindow, pose: Array, prior: PoseGaussian, error: WindowError
 ) -> Refined:
     """Refine poses (m, 5) on one plane by damped Gauss-Newton, each for itself, in twelve steps at most.
+
+    Those far worse than the best after a few steps go no further.
 
     Positions stay on the plane's grid: outside it nothing was searched.
     """
@@ -86,30 +97,26 @@ def refine_poses(
     low = np.array(plane.origin_m)
     high = low + plane.resolution_m * (np.array(plane.shape[::-1]) - 1)
     here = _linearise(floor, plane, window, pose, prior, error)
-    damping = np.full(len(pose), 1e-3)
-    for _ in range(_STEPS):
-        trial = pose + _damped_step(here, prior, damping, plane.resolution_m)
+    damping, moving = np.full(len(pose), 1e-3), np.arange(len(pose))
+    for step in range(_STEPS):
+        now = here.take(moving)
+        trial = pose[moving] + _damped_step(now, prior, damping[moving], plane.resolution_m)
         trial[:, :2] = np.clip(trial[:, :2], low, high)
-        step = trial - pose
         there = _linearise(floor, plane, window, trial, prior, error)
-        better = there.objective > here.objective
-        pose[better] = trial[better]
-        here = _choose(better, there, here)
-        damping = np.where(better, damping * 0.2, damping * 8.0)
-        if np.all(np.abs(step[:, :2]) < 1e-3):
+        better = there.objective > now.objective
+        moved = np.linalg.norm(trial[:, :2] - pose[moving, :2], axis=1)
+        chosen = moving[better]
+        pose[chosen] = trial[better]
+        here.put(chosen, there.take(better))
+        damping[moving] *= np.where(better, 0.2, 8.0)
+        hopeful = here.objective[moving] > here.objective.max() - (_HOPEFUL_NATS if step >= _FIRST_STEPS else np.inf)
+        moving = moving[(moved > _STILL_M) & hopeful]
+        if not len(moving):
             break
     covariance = _covariance(here.information, prior)
     return Refined(
         pose, here.log_l, here.objective, here.distance2, covariance, here.residual, here.variance, here.bias
     )
-
-
-def pose_fit(
-    floor: SearchableFloor, plane: Plane, window: ReducedWindow, pose: Array, prior: PoseGaussian, error: WindowError
-) -> tuple[Array, Array]:
-    """Log density and objective (m,) of poses (m, 5), as refinement sees them."""
-    here = _linearise(floor, plane, window, pose, prior, error)
-    return here.log_l, here.objective
 
 
 def _linearise(
@@ -197,13 +204,6 @@ def _damped_step(here: _Linearised, prior: PoseGaussian, damping: Array, reach_m
     step = np.linalg.solve(matrix, (here.gradient * free)[..., None])[..., 0]
     length = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
     return np.asarray(step * np.minimum(1.0, 2.0 * reach_m / np.maximum(length, 1e-12)))
-
-
-def _choose(better: NDArray[np.bool_], there: _Linearised, here: _Linearised) -> _Linearised:
-    def pick(a: Array, b: Array) -> Array:
-        return np.where(better.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-
-    return _Linearised(*(pick(getattr(there, name), getattr(here, name)) for name in _Linearised.__slots__))
 
 
 def _covariance(information: Array, prior: PoseGaussian) -> Array:
