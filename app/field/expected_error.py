@@ -3,14 +3,13 @@
 A window is a stretch of path whose last point p is asked for. Its readings tell of p, and of nuisances: the heading
 theta of the whole stretch (a vector map also sees the readings turn) and a constant sensor offset b per component.
 With the exact gradient J of the map's mean, a reading at q from p moves by `J (dp + q' dtheta + q eps) - t dtheta - b`,
-q' and t being q and the mean field turned by +90 degrees. Heading and offset are eliminated by Schur complements, each
-under its Gaussian prior. The scale eps of the displacements is in error too, but positioning takes it as told: that
-adds what such an error moves the estimate by (a "consider" parameter, Schmidt 1966), so that the figure is what this
-service can reach, not what one that estimates the scale could. It is the predictive, directional measure that
-(Kuevor B30) asks for and that its GLM, which needs the true position, is not.
+q' and t being q and the mean field turned by +90 degrees. Heading, offset and the scale eps of the displacements are
+eliminated by Schur complements, each under its Gaussian prior, as positioning estimates them. It is the predictive,
+directional measure that (Kuevor B30) asks for and that its GLM, which needs the true position, is not.
 
 Errors that stay alike along the path (the map's own, and what surveys showed of every other cause) are worth one
-independent reading per DECORRELATED_SHARE of their correlation length, as in positioning; white noise averages out.
+independent reading per DECORRELATED_SHARE of their correlation length: less than the covariance a window is matched
+with, but one figure for a whole floor at once. White noise averages out.
 """
 
 from dataclasses import dataclass
@@ -48,7 +47,7 @@ class WindowModel:
     noise_uT           sd of white noise of one reading, per axis; one reading every `spacing_m` walked
     bias_sd_uT         sd of a constant offset per component: 0 calibrated, inf unknown (a demeaned window)
     heading_sd_rad     of the window's frame: 0 known, UNKNOWN_HEADING_SD_RAD unknown
-    scale_sd           relative sd of the displacements' scale, which is not estimated
+    scale_sd           relative sd of the displacements' scale
     """
 
     length_m: float = 10.0
@@ -56,7 +55,7 @@ class WindowModel:
     spacing_m: float = 0.25
     bias_sd_uT: float = 0.0
     heading_sd_rad: float = UNKNOWN_HEADING_SD_RAD
-    scale_sd: float = 0.02
+    scale_sd: float = 0.05
 
 
 def point_information(grid: FieldGrid, layer: int, noise_uT: float) -> Array:
@@ -84,10 +83,8 @@ def window_covariance_m2(grid: FieldGrid, position_m: Array, window: WindowModel
     told = np.einsum("nc,nca->ca", weight, jacobian)
     known = weight.sum(axis=0) + _precision(window.bias_sd_uT)
     information -= np.einsum("ca,cb,c->ab", told, told, 1.0 / np.maximum(known, 1e-300))
-    estimated = information[:3, :3] + np.diag([*_extent_precision(grid), _precision(window.heading_sd_rad)])
-    covariance = np.linalg.inv(estimated)
-    moved = (covariance @ information[:3, 3])[:2] * window.scale_sd
-    return np.asarray(covariance[:2, :2] + np.outer(moved, moved))
+    known_before = [*_extent_precision(grid), _precision(window.heading_sd_rad), _precision(window.scale_sd)]
+    return np.asarray(np.linalg.inv(information + np.diag(known_before))[:2, :2])
 
 
 def expected_error_m(grid: FieldGrid, layer: int, window: WindowModel) -> Array:
@@ -106,11 +103,10 @@ def expected_error_m(grid: FieldGrid, layer: int, window: WindowModel) -> Array:
     angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     from_last_m = -behind_m[None, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
     cells = np.rint(from_last_m[..., ::-1] / step_m).astype(np.int64)
-    prior = np.array([*_extent_precision(grid), 0.0, _precision(window.heading_sd_rad)])
+    prior = np.array([*_extent_precision(grid), _precision(window.scale_sd), _precision(window.heading_sd_rad)])
     error = _expected_error(
-        slope, _turn(mean, grid), weight, measured, cells, from_last_m, prior, _precision(window.bias_sd_uT),
-        window.scale_sd,
-    )  # fmt: skip
+        slope, _turn(mean, grid), weight, measured, cells, from_last_m, prior, _precision(window.bias_sd_uT)
+    )
     ny, nx = grid.measured.shape[1:]
     whole = np.repeat(np.repeat(error, stride, axis=0), stride, axis=1)[:ny, :nx]
     return np.asarray(np.where(grid.measured[layer], whole, np.nan))
@@ -147,7 +143,7 @@ def _precision(sd: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bias_precision, scale_sd):  # type: ignore[no-untyped-def]
+def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bias_precision):  # type: ignore[no-untyped-def]
     """(ny, nx) rms over directions, by the formulae of `window_covariance_m2`; columns: x, y, scale, heading."""
     ny, nx, c = turn.shape
     directions, n, _ = cells.shape
@@ -182,14 +178,12 @@ def _expected_error(slope, turn, weight, measured, cells, from_last_m, prior, bi
                         for m in range(c):
                             information[a, b] -= told[m, a] * told[m, b] / max(known[m], 1e-300)
                     information[a, a] += prior[a]
-                for a in range(3):  # eliminate the heading
-                    for b in range(a + 1):
-                        information[a, b] -= information[3, a] * information[3, b] / information[3, 3]
+                for last in (3, 2):  # eliminate the heading, then the scale
+                    for a in range(last):
+                        for b in range(a + 1):
+                            information[a, b] -= information[last, a] * information[last, b] / information[last, last]
                 xx, xy, yy = information[0, 0], information[1, 0], information[1, 1]
-                determinant = xx * yy - xy**2
-                by_scale_x = (yy * information[2, 0] - xy * information[2, 1]) / determinant
-                by_scale_y = (xx * information[2, 1] - xy * information[2, 0]) / determinant
-                total += (xx + yy) / determinant + scale_sd**2 * (by_scale_x**2 + by_scale_y**2)
+                total += (xx + yy) / (xx * yy - xy**2)
                 judged += 1
             if judged:
                 error[j, i] = np.sqrt(total / judged)
