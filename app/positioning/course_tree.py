@@ -27,12 +27,16 @@ class Tree(NamedTuple):
     """All groups of all stages; the courses, each on its own, come first, as groups 0 to h - 1.
 
     place     (g, n, 3) per sample: first row and first column of the group's displacements from the middle cell, and
-              the level of squares, from one, that covers a block so displaced; of a course alone: that of the block
+              the index of the squares that cover a block so displaced; of a course alone zero: those of the block
     feature   (g, n, 2 c) lower, then upper bounds of the features, uT
     exact     (h, n, c) features of the courses, uT
     middle    (g, 4) least and largest row, least and largest column of the middle sample from the last
+    reference, slope, loose   (g - h, n, 2 + c), (g - h, n, 3, 4), (g - h, n, 4) of the groups that are not one course: row,
+              column and features at the middle of the box, what (row, column and first two features) changes from there
+              to its side along each dimension, and by how much a course may differ from that
     heading   (g, 2) cosine and sine of one of its headings
     cost      (g,) least -2 log prior
+    typical   (g,) a course in the middle of the group
     leaves    (g,) courses held
     size      (g,) twice the log of it
     first     (g + 1,) where a group's parts in the stage below begin in `part`
@@ -43,8 +47,12 @@ class Tree(NamedTuple):
     feature: NDArray[np.float32]
     exact: Array
     middle: Index
+    reference: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    loose: NDArray[np.float32]
     heading: Array
     cost: Array
+    typical: Index
     leaves: Index
     size: Array
     first: Index
@@ -79,7 +87,7 @@ def course_tree(
     share: float,
     headings_apart: bool,
 ) -> CourseTree:
-    """Groups for blocks up to 2^top cells, for the levels of squares `places` of a pyramid.
+    """Groups for blocks up to 2^top cells, for the squares `places` of a pyramid.
 
     order           in which the samples are compared
     middle_sample   the one that displacements count from
@@ -102,7 +110,10 @@ def course_tree(
     exact = np.ascontiguousarray(turned.features_uT[:, order])
     middle, cost = np.empty((groups, 4), dtype=np.int32), np.empty(groups)
     leaves, first = np.ones(groups, dtype=np.int32), np.zeros(groups + 1, dtype=np.int32)
-    level = np.zeros((groups, n), dtype=np.int32)
+    level, typical = np.zeros((groups, n), dtype=np.int32), np.arange(groups, dtype=np.int32)
+    more = groups - len(courses)
+    reference, slope = np.zeros((more, n, 2 + c), dtype=np.float32), np.zeros((more, n, 3, 4), dtype=np.float32)
+    loose = np.zeros((more, n, 4), dtype=np.float32)
     _leaves(offset, exact, order, middle_sample, extent, feature, middle)
     cost[: len(courses)] = -2.0 * courses.log_prior
     heading = np.empty((groups, 2))
@@ -118,12 +129,16 @@ def course_tree(
             parts.append((part + below.first).astype(np.int32))
             _join(start, first[start : start + size + 1] - first[start], parts[-1], extent, feature, middle, cost, leaves)
             heading[start : start + size] = heading[parts[-1][first[start : start + size] - first[start]]]
-            _choose_level(extent[start : start + size], l, places, level[start : start + size])
+            held = first[start : start + size] - first[start]
+            typical[start : start + size] = typical[parts[-1][held + counted // 2]]
+            own = slice(start - len(courses), start - len(courses) + size)
+            _linearise(counts, tuple(shifts[l].tolist()), extent, exact, reference[own], slope[own], loose[own])
+            _choose_squares(extent[start : start + size], l, places, level[start : start + size])
         stages.append(stage)
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
     part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
-    return CourseTree(Tree(place, feature, exact, middle, heading, cost, leaves, 2.0 * np.log(leaves), first, part), tuple(stages))
+    return CourseTree(Tree(place, feature, exact, middle, reference, slope, loose, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, part), tuple(stages))
 
 
 def _counts(courses: Courses) -> tuple[int, int, int]:
@@ -236,22 +251,68 @@ def _join(start, first, part, extent, feature, middle, cost, leaves):  # type: i
 
 
 @numba.njit(cache=True, nogil=True)
-def _choose_level(extent, block_level, places, level):  # type: ignore[no-untyped-def]
-    """Per group and sample the lowest level of squares that covers a block, whose corner is a multiple of its side,
-    anywhere in the extent; where the squares' steps are no larger than the block, their start is known exactly."""
-    side, last = 1 << block_level, len(places)
+def _linearise(counts, shift, extent, exact, reference, slope, loose):  # type: ignore[no-untyped-def]
+    """What displacements and features of a stage's groups are to first order in the place of a course in its box."""
+    n, c = exact.shape[1], exact.shape[2]
+    turning = min(c, 2)
+    width = (1 << shift[0], 1 << shift[1], 1 << shift[2])
+    g = -1
+    for a in range(0, counts[0], width[0]):
+        for b in range(0, counts[1], width[1]):
+            for d in range(0, counts[2], width[2]):
+                g += 1
+                low = (a, b, d)
+                high = (min(a + width[0], counts[0]) - 1, min(b + width[1], counts[1]) - 1, min(d + width[2], counts[2]) - 1)
+                for last in (False, True):  # first the means, then what differs from the plane
+                    squares = np.zeros(3)
+                    for x in range(a, high[0] + 1):
+                        for y in range(b, high[1] + 1):
+                            for z in range(d, high[2] + 1):
+                                h = (x * counts[1] + y) * counts[2] + z
+                                place = (x, y, z)
+                                t = np.zeros(3)
+                                for q in range(3):
+                                    if high[q] > low[q]:
+                                        t[q] = (2.0 * place[q] - low[q] - high[q]) / (high[q] - low[q])
+                                    squares[q] += t[q] * t[q]
+                                for k in range(n):
+                                    for v in range(2 + turning):
+                                        value = extent[h, k, 2 * v] * 1.0 if v < 2 else exact[h, k, v - 2]
+                                        if not last:
+                                            reference[g, k, v] += value
+                                            for q in range(3):
+                                                slope[g, k, q, v] += t[q] * value
+                                        else:
+                                            off = value - reference[g, k, v]
+                                            for q in range(3):
+                                                off -= t[q] * slope[g, k, q, v]
+                                            loose[g, k, v] = max(loose[g, k, v], abs(off) * (1.0 + 1e-6) + 1e-6)
+                    if not last:
+                        held = (high[0] - low[0] + 1) * (high[1] - low[1] + 1) * (high[2] - low[2] + 1)
+                        for k in range(n):
+                            for v in range(2 + turning):
+                                reference[g, k, v] /= held
+                                for q in range(3):
+                                    slope[g, k, q, v] /= max(squares[q], 1e-9)
+                            for v in range(2 + turning, 2 + c):
+                                reference[g, k, v] = exact[(a * counts[1] + b) * counts[2] + d, k, v - 2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _choose_squares(extent, block_level, places, chosen):  # type: ignore[no-untyped-def]
+    """Per group and sample the smallest squares that cover a block, whose corner is a multiple of its side, anywhere in
+    the extent; where the squares' steps are no larger than the block, their start is known exactly."""
+    side, last = 1 << block_level, len(places) - 1
     for g in range(extent.shape[0]):
         for k in range(extent.shape[1]):
             rows, columns = side + extent[g, k, 1] - extent[g, k, 0], side + extent[g, k, 3] - extent[g, k, 2]
-            found = last
-            for l in range(block_level, last):
-                base, shift = places[l - 1, 0], places[l - 1, 1]
-                step, covered = 1 << shift, 1 << l
+            chosen[g, k] = last
+            for l in range(last):
+                base, shift, covered = places[l, 0], places[l, 1], places[l, 5]
                 down = right = 0
                 if shift <= block_level:
-                    covered += step - 1
-                    down, right = (extent[g, k, 0] + base) & (step - 1), (extent[g, k, 2] + base) & (step - 1)
+                    covered += (1 << shift) - 1
+                    down, right = (extent[g, k, 0] + base) & ((1 << shift) - 1), (extent[g, k, 2] + base) & ((1 << shift) - 1)
                 if down + rows <= covered and right + columns <= covered:
-                    found = l
+                    chosen[g, k] = l
                     break
-            level[g, k] = found

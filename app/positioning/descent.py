@@ -5,8 +5,10 @@ import math
 import numba
 import numpy as np
 
+from app.field.tangents import FLAT_SIDE
 from app.positioning.kernels import limit_of, plain_bounds, pose_costs, spare_cost
 from app.positioning.offset_bound import offset_bounds
+from app.positioning.tangent_bound import tangent_bounds
 
 __all__ = ["bound_nodes", "dive", "sift", "split_nodes", "top_nodes"]
 
@@ -52,14 +54,23 @@ def top_nodes(first, last, level, row, column, height, width, tree, scene):  # t
 
 
 @numba.njit(cache=True, nogil=True)
+def _ranges(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
+    if scene.offset[0]:
+        return offset_bounds(nodes, costs, level, tree, scene, best, window, allowed)
+    return plain_bounds(nodes, costs, level, tree, scene, best, window, allowed)
+
+
+@numba.njit(cache=True, nogil=True)
 def bound_nodes(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
     """Turn the prior costs (k,) of nodes (k, 3) into bounds of their poses' costs, at level zero into these, given up
     beyond their `limit_of`. Returns how many nodes were reached, and the samples compared, hardly more than `allowed`."""
     if level == 0:
         return pose_costs(nodes, costs, tree, scene, best, window, allowed)
-    if scene.offset[0]:
-        return offset_bounds(nodes, costs, level, tree, scene, best, window, allowed)
-    return plain_bounds(nodes, costs, level, tree, scene, best, window, allowed)
+    if 1 << level <= FLAT_SIDE:
+        return _ranges(nodes, costs, level, tree, scene, best, window, allowed)
+    priors = costs.copy()
+    done, work = _ranges(nodes, costs, level, tree, scene, best, window, allowed)
+    return done, work + tangent_bounds(nodes[:done], costs[:done], priors, priors.copy(), level, tree, scene, best, window)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -111,18 +122,45 @@ def sift(nodes, bounds, level, tree, scene, best, window):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, nogil=True)
-def dive(nodes, bounds, level, beam, tree, scene, best):  # type: ignore[no-untyped-def]
-    """Follow the `beam` most promising nodes of a level down to a pose: (course, row, column) of its middle, and its
-    cost; if that is not below `best`, it need not be the best of the beam, nor the cost exact. None (0, 3) if the beam
-    holds none."""
+def _guesses(nodes, bounds, level, tree, scene):  # type: ignore[no-untyped-def]
+    """What the best pose of each node may cost: were the field its tangents, or, of small blocks, that in the middle."""
+    guesses = np.empty(len(nodes))
+    for p in range(len(nodes)):
+        guesses[p] = tree.cost[nodes[p, 0]] + scene.constant
+    if 1 << level > FLAT_SIDE:
+        tangent_bounds(nodes, bounds.copy(), guesses.copy(), guesses, level, tree, scene, np.inf, 0.0)
+        return guesses
+    middle = nodes + (1 << level - 1)
+    for p in range(len(nodes)):
+        middle[p, 0] = tree.typical[nodes[p, 0]]
+    pose_costs(middle, guesses, tree, scene, np.inf, 0.0, 1 << 60)
+    return guesses
+
+
+@numba.njit(cache=True, nogil=True)
+def dive(nodes, bounds, level, wide, beam, tree, scene, best):  # type: ignore[no-untyped-def]
+    """Follow the most promising nodes of a level down to a pose: (course, row, column) of its middle, and its cost; if
+    that is not below `best`, it need not be the best of them, nor the cost exact. None (0, 3) if they hold none.
+
+    Bounds of large blocks say little about which is best: of the `wide` with the lowest, and of their parts, `beam` are
+    followed, those whose best pose is guessed to cost least.
+    """
+    nodes, bounds = _lowest(nodes, bounds, wide)
     while level > 0 and len(nodes):
-        if len(nodes) > beam:
-            chosen = np.flatnonzero(bounds <= np.partition(bounds, beam)[beam])[: 2 * beam]
-            nodes, bounds = nodes[chosen], bounds[chosen]
+        nodes, bounds = _lowest(nodes, _guesses(nodes, bounds, level, tree, scene), beam)
         level -= 1
         nodes, bounds, _ = split_nodes(nodes, bounds, level, tree, scene)
-        bound_nodes(nodes, bounds, level, tree, scene, best, 0.0, 1 << 60)
+    pose_costs(nodes, bounds, tree, scene, best, 0.0, 1 << 60)
     if not len(nodes):
         return nodes, np.inf
     least = np.argmin(bounds)
     return nodes[least : least + 1].copy(), bounds[least]
+
+
+@numba.njit(cache=True, nogil=True)
+def _lowest(nodes, values, count):  # type: ignore[no-untyped-def]
+    """About `count` nodes with the lowest values."""
+    if len(nodes) <= count:
+        return nodes, values
+    chosen = np.flatnonzero(values <= np.partition(values, count)[count])[: 2 * count]
+    return nodes[chosen], values[chosen]

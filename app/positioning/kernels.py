@@ -34,6 +34,8 @@ class Scene(NamedTuple):
 
     mean, variance    (ny + 2, nx + 2, c) and (ny + 2, nx + 2): the field, with one cell of prior around
     records, codes, places   of the pyramid; codes are the records' bytes
+    doubling          of the pyramid: the squares that are blocks
+    planes, plane_first   of the pyramid: its tangents
     walkable          (ny + 1, nx + 1) summed-area table of cells the last sample may be in, or (0, 0): all
     noise             (n,) variance of the samples over the map's share
     kind              (n,) which ladder a sample uses
@@ -51,6 +53,9 @@ class Scene(NamedTuple):
     records: NDArray[np.float32]
     codes: NDArray[np.uint8]
     places: NDArray[np.int64]
+    doubling: NDArray[np.int64]
+    planes: NDArray[np.float32]
+    plane_first: NDArray[np.int64]
     walkable: NDArray[np.int64]
     noise: Array
     kind: NDArray[np.int64]
@@ -80,12 +85,12 @@ def limit_of(size, spare, best, window):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def record_of(j, i, l, places):  # type: ignore[no-untyped-def]
-    """Index of the record that covers the square of level l (from one) at (j, i)."""
-    base, shift = places[l - 1, 0], places[l - 1, 1]
-    height, width = places[l - 1, 2], places[l - 1, 3]
+    """Index of the record that covers the square at (j, i) of those with index l."""
+    base, shift = places[l, 0], places[l, 1]
+    height, width = places[l, 2], places[l, 3]
     a = min(max((j + base) >> shift, 0), height - 1)
     b = min(max((i + base) >> shift, 0), width - 1)
-    return places[l - 1, 4] + a * width + b
+    return places[l, 4] + a * width + b
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -107,7 +112,7 @@ def plain_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # ty
     place, feature, kind, ladder = tree.place, tree.feature, scene.kind, scene.ladder
     records, codes, places = scene.records, scene.codes, scene.places
     n, c = feature.shape[1], feature.shape[2] // 2
-    spare = spare_cost(level, scene.mean)
+    spare, square = spare_cost(level, scene.mean), scene.doubling[level]
     work = 0
     for p in range(len(nodes)):
         if work >= allowed:
@@ -115,7 +120,7 @@ def plain_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # ty
         g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
         known, stop = cost, limit_of(tree.size[g], spare, best, window)
         for k in range(n):
-            at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
+            at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], square), places)
             if c == 3:
                 x = max(max(feature[g, k, 0] - records[at, 3], records[at, 0] - feature[g, k, 3]), NOTHING)
                 y = max(max(feature[g, k, 1] - records[at, 4], records[at, 1] - feature[g, k, 4]), NOTHING)

@@ -65,7 +65,7 @@ def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _offset_bound(  # type: ignore[no-untyped-def]
-    g, j, i, level, place, feature, heading, kind, ladder, records, codes, places, turn, headed, offset, cost, stop, box, weight
+    g, j, i, square, place, feature, heading, kind, ladder, records, codes, places, turn, headed, offset, cost, stop, box, weight
 ):
     """`cost` plus the bound of the block at (j, i), given up as soon as it exceeds `stop`; and the samples compared.
 
@@ -79,7 +79,7 @@ def _offset_bound(  # type: ignore[no-untyped-def]
     hx, hy, hz = precision, precision, precision
     cost += least
     for k in range(n):
-        at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
+        at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], square), places)
         for m in range(c):
             box[k, m] = feature[g, k, m] - records[at, c + m]
             box[k, 3 + m] = feature[g, k, c + m] - records[at, m]
@@ -143,14 +143,14 @@ def offset_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # t
     records, codes, places, turn = scene.records, scene.codes, scene.places, scene.turn
     n, c = feature.shape[1], feature.shape[2] // 2
     box, weight = np.zeros((n, 6)), np.empty(n)
-    spare = spare_cost(level, scene.mean)
+    spare, square = spare_cost(level, scene.mean), scene.doubling[level]
     work = 0
     for p in range(len(nodes)):
         if work >= allowed:
             return p, work
         known, stop = costs[p], limit_of(tree.size[nodes[p, 0]], spare, best, window)
         bound, used = _offset_bound(
-            nodes[p, 0], nodes[p, 1], nodes[p, 2], level, place, feature, heading, kind, ladder, records, codes, places, turn,
+            nodes[p, 0], nodes[p, 1], nodes[p, 2], square, place, feature, heading, kind, ladder, records, codes, places, turn,
             scene.headed, scene.offset, known, stop, box, weight,
         )  # fmt: skip
         costs[p] = bound - SLACK * (1.0 + bound - known) - ROUNDING * abs(bound)

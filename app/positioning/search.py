@@ -31,9 +31,10 @@ CAPACITY = 400_000  # poses kept at most
 BUDGET = 4_000_000_000  # values compared per plane at most: poses or nodes, times samples, times components
 _TOP_SHARE = 0.25  # of the budget, for the nodes the search starts from
 _NODES_PER_POSE = 2  # how many nodes of a level may be followed, per pose of the capacity
-_TOP, _OFFSET_TOP = 5, 4  # levels to start from: what larger blocks hold is hardly ever excluded
+_TOP, _OFFSET_TOP = 4, 4  # levels to start from: what larger blocks hold is hardly ever excluded
 _SHARE = 1.0  # of a block's side, by which a group of courses may spread the samples
 _BEAM = 16
+_WIDE, _OFFSET_WIDE = 100, 1000
 _DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _CHUNK = 4_000  # nodes split between two looks at the caller's patience
@@ -99,9 +100,9 @@ class _OnPlane:
 
     def dive(self, nodes: Nodes, bounds: Array, level: int, best: float) -> tuple[Nodes, float]:
         """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds one."""
-        beam = _BEAM
+        beam, wide = _BEAM, _OFFSET_WIDE if self.scene.offset[0] else _WIDE
         while True:
-            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, best)
+            pose, cost = dive(nodes, bounds, level, max(wide, beam), beam, self.tree, self.scene, best)
             if len(pose) or beam >= len(nodes):
                 return pose, float(cost)
             beam *= 8
@@ -147,15 +148,12 @@ def search(
     says so; what that leaves out is counted in `missed_mass`, and `complete` says so.
     """
     on_planes, expected = _on_planes(planes, window, courses, prior, error, budget)
-    sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget, _Patience(out_of_time))
-    starts = [sweep.start(on_plane, expected) for on_plane in on_planes]
-    ranks = np.argsort([start.least for start in starts], kind="stable")
-    for k in ranks:  # the most promising first, until a pose is as good as one that matches
-        if sweep.best > expected:
-            sweep.seed(on_planes[k], starts[k])
-    found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(planes)
-    for k in ranks:
-        found[k] = sweep.run(on_planes[k], starts[k])
+    patience = _Patience(out_of_time)
+    sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget, patience, expected)
+    found = sweep.over(on_planes)
+    if not any(len(poses) and costs.min() <= expected for poses, costs in found):  # nothing matches that well
+        sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget - sweep.used, patience, None)
+        found = sweep.over(on_planes)
     plane = np.concatenate([np.full(len(poses), k) for k, (poses, _) in enumerate(found)])
     poses = np.concatenate([on_planes[k].last_cells(poses) for k, (poses, _) in enumerate(found)]).astype(np.int64)
     cost = np.concatenate([cost for _, cost in found])
@@ -170,7 +168,7 @@ def search(
         column=poses[order, 2],
         score=-0.5 * cost[order],
         window_nats=0.5 * sweep.window,
-        complete=sweep.window == 2.0 * window_nats and not sweep.patience.ended,
+        complete=sweep.reach > sweep.best + sweep.asked and not sweep.patience.ended,
         missed_mass=sweep.missed_mass,
         poses=len(courses) * sum(p.shape[0] * p.shape[1] for p in planes),
     )
@@ -190,7 +188,7 @@ def _on_planes(
             steep = max(p.gradient_uT_per_m for p in planes) * plane.resolution_m
             trees[plane.resolution_m] = course_tree(
                 courses, turn_window(window, courses, plane.resolution_m), order, int(np.argmin(along)),
-                plane.pyramid.places, len(plane.pyramid.levels), 1.0 / max(steep, 1e-3),
+                plane.pyramid.places, len(plane.pyramid.doubling) - 1, 1.0 / max(steep, 1e-3),
                 _SHARE, scene.headed,
             )  # fmt: skip
         tree = trees[plane.resolution_m]
@@ -226,13 +224,10 @@ class _Patience:
 
 @dataclass(slots=True, eq=False)
 class _Start:
-    """The top nodes of a plane, what their priors cost, and their bounds, followed up to `followed_to`; a pose (1, 3)
-    that was found, or none."""
+    """The top nodes of a plane with their bounds, and what these took of the budget; a pose (1, 3) that was found."""
 
     nodes: Nodes
-    prior_costs: Array
     bounds: Array
-    followed_to: float
     used: int
     seed: Nodes
     seed_cost: float
@@ -243,41 +238,59 @@ class _Start:
 
 
 class _Sweep:
-    """Level by level over one plane after the other; the incumbent and the window carry over."""
+    """Level by level over one plane after the other; the incumbent and the window carry over.
 
-    def __init__(self, window: float, capacity: int, budget: int, patience: _Patience) -> None:
-        self.best, self.window, self.capacity = np.inf, window, max(capacity, 1)
-        self.budget, self.patience = budget, patience
+    The incumbent's cost is at first `assumed`, that of a pose which matches; without that a pose is looked for.
+    """
+
+    def __init__(self, asked: float, capacity: int, budget: int, patience: _Patience, assumed: float | None) -> None:
+        self.asked, self.capacity, self.budget, self.patience = asked, max(capacity, 1), budget, patience
+        self.assumed, self.best = assumed is not None, np.inf if assumed is None else assumed
+        self.reach = np.inf  # cost from which poses were left out for want of room, budget or time
+        self.used = 0  # of the budget, on the plane that took most
         self.missed_mass = 0.0  # at most, relative to the best pose
 
-    def start(self, on_plane: _OnPlane, expected: float) -> _Start:
-        """Bound the top nodes as far as a matching window needs it."""
-        nodes, costs = on_plane.top_nodes()
-        bounds = costs.copy()
-        used = self._bound(on_plane, nodes, bounds, expected)
-        return _Start(nodes, costs, bounds, expected, used, np.empty((0, 3), np.int32), np.inf)
+    @property
+    def window(self) -> float:
+        return max(min(self.asked, self.reach - self.best), 0.0)
 
-    def seed(self, on_plane: _OnPlane, start: _Start) -> None:
-        """Follow the most promising top nodes of a plane down to a pose."""
-        if len(start.nodes):
-            start.seed, start.seed_cost = on_plane.dive(start.nodes, start.bounds, on_plane.top, np.inf)
-            self._improve(start.seed_cost)
+    def over(self, on_planes: Sequence[_OnPlane]) -> list[tuple[Nodes, Array]]:
+        """Per plane the poses within the window of the best so far, with their costs; the most promising plane first."""
+        starts = [self._start(on_plane) for on_plane in on_planes]
+        if not self.assumed:
+            for on_plane, start in zip(on_planes, starts, strict=True):
+                self._seed(on_plane, start, start.nodes, start.bounds, on_plane.top)
+            for on_plane, start in zip(on_planes, starts, strict=True):
+                start.bounds[:], used = self._bound(on_plane, start.nodes)
+                start.used += used
+        found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(on_planes)
+        for k in np.argsort([start.least for start in starts], kind="stable"):
+            found[k] = self._run(on_planes[k], starts[k])
+        return found
 
-    def run(self, on_plane: _OnPlane, start: _Start) -> tuple[Nodes, Array]:
-        """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
+    def _start(self, on_plane: _OnPlane) -> _Start:
+        nodes, bounds = on_plane.top_nodes()
+        if not self.assumed:
+            return _Start(nodes, bounds, 0, np.empty((0, 3), np.int32), np.inf)
+        bounds, used = self._bound(on_plane, nodes)
+        return _Start(nodes, bounds, used, np.empty((0, 3), np.int32), np.inf)
+
+    def _seed(self, on_plane: _OnPlane, start: _Start, nodes: Nodes, bounds: Array, level: int) -> None:
+        """Follow the most promising nodes down to a pose."""
+        pose, cost = on_plane.dive(nodes, bounds, level, self.best)
+        if cost < self.best:
+            start.seed, start.seed_cost = pose, cost
+            self._improve(cost)
+
+    def _run(self, on_plane: _OnPlane, start: _Start) -> tuple[Nodes, Array]:
         nodes, bounds, left = start.nodes, start.bounds, self.budget - start.used
-        if self.best > start.followed_to:
-            bounds = start.prior_costs.copy()
-            left -= self._bound(on_plane, nodes, bounds, self.best)
         for level in range(on_plane.top - 1, -1, -1):
             nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
-            if len(nodes) > _DIVE_AGAIN:
-                pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best)
-                if cost < start.seed_cost:
-                    start.seed, start.seed_cost = pose, cost
-                    self._improve(cost)
-            nodes, bounds, used = self._split(on_plane, nodes, bounds, level, left // (level + 1))
+            if len(nodes) > _DIVE_AGAIN or (self.assumed and len(nodes) > _BEAM):
+                self._seed(on_plane, start, nodes, bounds, level + 1)
+            nodes, bounds, used = self._split(on_plane, nodes, bounds, level, max(left, 0) // (level + 1))
             left -= used
+        self.used = max(self.used, self.budget - left)
         return self._poses(nodes, bounds, start)
 
     def miss(self, poses: Array, bounds: Array) -> None:
@@ -297,15 +310,16 @@ class _Sweep:
         self.miss(np.ones(len(costs) - int(keep.sum())), costs[~keep])
         return nodes[keep], costs[keep]
 
-    def _bound(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, best: float) -> int:
-        """Bound top nodes, those that are reached in time; returns the values compared."""
+    def _bound(self, on_plane: _OnPlane, nodes: Nodes) -> tuple[Array, int]:
+        """Bounds of top nodes, of those not reached in time what they cost by their priors; and the values compared."""
+        bounds = on_plane.top_nodes()[1]
         used = 0
         for first in range(0, len(nodes), 8 * _CHUNK):
             if self.patience.over():
                 break
             part = slice(first, first + 8 * _CHUNK)
-            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, best, self.window, _ENDLESS)[1]
-        return used
+            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, self.best, self.window, _ENDLESS)[1]
+        return bounds, used
 
     def _split(
         self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int, allowed: int
@@ -325,6 +339,8 @@ class _Sweep:
             reached, compared = on_plane.bound(parts, costs, level, self.best, self.window, allowed - used)
             if reached < len(parts):
                 self._leave(on_plane, parts[reached:], known[reached:], level)
+            if level == 0 and reached:
+                self._improve(float(costs[:reached].min()))
             *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best, self.window)
             found.append((kept[0], kept[1]))
             done, used, self.missed_mass = done + _CHUNK, used + compared, self.missed_mass + missed
@@ -337,7 +353,7 @@ class _Sweep:
     def _leave(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> None:
         """Leave out nodes that were not reached: the window ends where they may begin."""
         self.miss(on_plane.poses(nodes, level), bounds)
-        self.window = min(self.window, max(float(bounds.min()) - self.best, 0.0))
+        self.reach = min(self.reach, float(bounds.min()))
 
     def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
         """Those within the window; it shrinks when they are more than there is room for."""
@@ -352,14 +368,14 @@ class _Sweep:
     def _improve(self, cost: float) -> None:
         if cost < self.best:
             self.missed_mass *= float(np.exp(0.5 * (cost - self.best)))
-            self.best = cost
+            self.best, self.assumed = cost, False
 
     def _keep(self, bounds: Array, room: int) -> NDArray[np.bool_]:
         """Which to follow: those within the window, which shrinks when they are more than there is room for."""
         keep = bounds <= self.best + self.window
         if keep.sum() <= room:
             return keep
-        self.window = max(float(np.partition(bounds, room)[room]) - self.best, 0.0)
+        self.reach = min(self.reach, float(np.partition(bounds, room)[room]))
         chosen = np.flatnonzero(bounds <= self.best + self.window)
         if len(chosen) > room:  # as good as equal: some of them, evenly
             chosen = chosen[np.linspace(0, len(chosen) - 1, room).astype(np.int64)]
