@@ -14,7 +14,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from app.field.tangents import tangents
 from app.geometry import Array
 
 __all__ = ["LADDER_STEPS", "Level", "Pyramid", "build_pyramid", "variance_ladder"]
@@ -50,7 +49,6 @@ class Pyramid:
     records   (k, width) of all levels, row by row, the smallest squares first, then one that covers all cells
     places    (levels + 1, 6) where a level's lie among them: base, log2 of its step, height, width, first record, side
     doubling  index of the level of side 2^l at l, from one; a search may start from blocks of the last
-    tangents, tangent_first   planes over the larger squares, and where each level's begin among them
     """
 
     levels: tuple[Level, ...]
@@ -58,12 +56,10 @@ class Pyramid:
     records: Float32
     places: NDArray[np.int64]
     doubling: tuple[int, ...]
-    tangents: Float32
-    tangent_first: NDArray[np.int64]
 
     @property
     def nbytes(self) -> int:
-        return self.ladder_uT2.nbytes + self.records.nbytes + self.places.nbytes + self.tangents.nbytes
+        return self.ladder_uT2.nbytes + self.records.nbytes + self.places.nbytes
 
 
 def variance_ladder(variance_uT2: Array | Float32) -> Array:
@@ -87,7 +83,7 @@ def build_pyramid(mean_uT: Float32, variance_uT2: Float32, levels: int) -> Pyram
         bounds, codes = _widened(bounds, below, side), _widened(codes, below, side)
         built.append((side, step, _records(_thinned(bounds, side, step), _thinned(codes, side, step))))
         below = side
-    return _gathered(built, _records(whole, extremes), ladder, mean_uT)
+    return _gathered(built, _records(whole, extremes), ladder)
 
 
 def _squares(levels: int) -> list[tuple[int, int]]:
@@ -103,8 +99,8 @@ def _squares(levels: int) -> list[tuple[int, int]]:
     return [*squares, (2 << levels, max(1, (2 << levels) // 4))]
 
 
-def _gathered(built: list[tuple[int, int, Float32]], whole: Float32, ladder: Array, mean_uT: Float32) -> Pyramid:
-    """Levels, as (side, step, records), and the record of everything in one array; and the planes beside them."""
+def _gathered(built: list[tuple[int, int, Float32]], whole: Float32, ladder: Array) -> Pyramid:
+    """Levels, as (side, step, records), and the record of everything in one array."""
     places, first = [], 0
     for side, step, own in built:
         places.append((side + step, step.bit_length() - 1, own.shape[0], own.shape[1], first, side))
@@ -118,8 +114,7 @@ def _gathered(built: list[tuple[int, int, Float32]], whole: Float32, ladder: Arr
     table = np.array(places, dtype=np.int64)
     sides = [side for side, _, _ in built]
     doubling = tuple(sides.index(1 << level) for level in range(1, (sides[-1] // 2).bit_length()))
-    planes = tangents(mean_uT, whole[0, 0, : 2 * mean_uT.shape[2]], table)
-    return Pyramid(levels, ladder, records, table, (0, *doubling), *planes)
+    return Pyramid(levels, ladder, records, table, (0, *doubling))
 
 
 def _records(bounds: Float32, codes: Codes) -> Float32:

@@ -31,9 +31,6 @@ class Tree(NamedTuple):
     feature   (g, n, 2 c) lower, then upper bounds of the features, uT
     exact     (h, n, c) features of the courses, uT
     middle    (g, 4) least and largest row, least and largest column of the middle sample from the last
-    reference, slope, loose   (g - h, n, 2 + c), (g - h, n, 3, 4), (g - h, n, 4) of the groups that are not one course: row,
-              column and features at the middle of the box, what (row, column and first two features) changes from there
-              to its side along each dimension, and by how much a course may differ from that
     heading   (g, 2) cosine and sine of one of its headings
     cost      (g,) least -2 log prior
     typical   (g,) a course in the middle of the group
@@ -47,9 +44,6 @@ class Tree(NamedTuple):
     feature: NDArray[np.float32]
     exact: Array
     middle: Index
-    reference: NDArray[np.float32]
-    slope: NDArray[np.float32]
-    loose: NDArray[np.float32]
     heading: Array
     cost: Array
     typical: Index
@@ -111,9 +105,6 @@ def course_tree(
     middle, cost = np.empty((groups, 4), dtype=np.int32), np.empty(groups)
     leaves, first = np.ones(groups, dtype=np.int32), np.zeros(groups + 1, dtype=np.int32)
     level, typical = np.zeros((groups, n), dtype=np.int32), np.arange(groups, dtype=np.int32)
-    more = groups - len(courses)
-    reference, slope = np.zeros((more, n, 2 + c), dtype=np.float32), np.zeros((more, n, 3, 4), dtype=np.float32)
-    loose = np.zeros((more, n, 4), dtype=np.float32)
     _leaves(offset, exact, order, middle_sample, extent, feature, middle)
     cost[: len(courses)] = -2.0 * courses.log_prior
     heading = np.empty((groups, 2))
@@ -127,18 +118,21 @@ def course_tree(
             part, counted = _nest(counts, shifts[l - 1], shifts[l])
             first[start + 1 : start + size + 1] = first[start] + np.cumsum(counted)
             parts.append((part + below.first).astype(np.int32))
-            _join(start, first[start : start + size + 1] - first[start], parts[-1], extent, feature, middle, cost, leaves)
+            _join(
+                start, first[start : start + size + 1] - first[start], parts[-1], extent, feature, middle, cost, leaves
+            )
             heading[start : start + size] = heading[parts[-1][first[start : start + size] - first[start]]]
             held = first[start : start + size] - first[start]
             typical[start : start + size] = typical[parts[-1][held + counted // 2]]
-            own = slice(start - len(courses), start - len(courses) + size)
-            _linearise(counts, tuple(shifts[l].tolist()), extent, exact, reference[own], slope[own], loose[own])
             _choose_squares(extent[start : start + size], l, places, level[start : start + size])
         stages.append(stage)
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
     part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
-    return CourseTree(Tree(place, feature, exact, middle, reference, slope, loose, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, part), tuple(stages))
+    return CourseTree(
+        Tree(place, feature, exact, middle, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, part),
+        tuple(stages),
+    )
 
 
 def _counts(courses: Courses) -> tuple[int, int, int]:
@@ -170,7 +164,9 @@ def _spread_per_step(turned: Turned, middle: int, counts: tuple[int, int, int], 
     for axis in range(3):
         if counts[axis] < 2:
             continue
-        along = tuple(slice(None) if k == axis else slice(None, None, max(count // 3, 1)) for k, count in enumerate(counts))
+        along = tuple(
+            slice(None) if k == axis else slice(None, None, max(count // 3, 1)) for k, count in enumerate(counts)
+        )
         moved = np.diff(offset[along], axis=axis).astype(np.float64)
         turns = np.diff(feature[along], axis=axis) * cells_per_uT
         spread[axis] = np.sqrt(np.mean(np.square(moved).sum(axis=-1)) + np.mean(np.square(turns).sum(axis=-1)))
@@ -240,7 +236,10 @@ def _join(start, first, part, extent, feature, middle, cost, leaves):  # type: i
             p = part[b]
             cost[g], leaves[g] = min(cost[g], cost[p]), leaves[g] + leaves[p]
             for x in (0, 2):
-                middle[g, x], middle[g, x + 1] = min(middle[g, x], middle[p, x]), max(middle[g, x + 1], middle[p, x + 1])
+                middle[g, x], middle[g, x + 1] = (
+                    min(middle[g, x], middle[p, x]),
+                    max(middle[g, x + 1], middle[p, x + 1]),
+                )
             for k in range(n):
                 for x in (0, 2):
                     extent[g, k, x] = min(extent[g, k, x], extent[p, k, x])
@@ -248,54 +247,6 @@ def _join(start, first, part, extent, feature, middle, cost, leaves):  # type: i
                 for x in range(c):
                     feature[g, k, x] = min(feature[g, k, x], feature[p, k, x])
                     feature[g, k, c + x] = max(feature[g, k, c + x], feature[p, k, c + x])
-
-
-@numba.njit(cache=True, nogil=True)
-def _linearise(counts, shift, extent, exact, reference, slope, loose):  # type: ignore[no-untyped-def]
-    """What displacements and features of a stage's groups are to first order in the place of a course in its box."""
-    n, c = exact.shape[1], exact.shape[2]
-    turning = min(c, 2)
-    width = (1 << shift[0], 1 << shift[1], 1 << shift[2])
-    g = -1
-    for a in range(0, counts[0], width[0]):
-        for b in range(0, counts[1], width[1]):
-            for d in range(0, counts[2], width[2]):
-                g += 1
-                low = (a, b, d)
-                high = (min(a + width[0], counts[0]) - 1, min(b + width[1], counts[1]) - 1, min(d + width[2], counts[2]) - 1)
-                for last in (False, True):  # first the means, then what differs from the plane
-                    squares = np.zeros(3)
-                    for x in range(a, high[0] + 1):
-                        for y in range(b, high[1] + 1):
-                            for z in range(d, high[2] + 1):
-                                h = (x * counts[1] + y) * counts[2] + z
-                                place = (x, y, z)
-                                t = np.zeros(3)
-                                for q in range(3):
-                                    if high[q] > low[q]:
-                                        t[q] = (2.0 * place[q] - low[q] - high[q]) / (high[q] - low[q])
-                                    squares[q] += t[q] * t[q]
-                                for k in range(n):
-                                    for v in range(2 + turning):
-                                        value = extent[h, k, 2 * v] * 1.0 if v < 2 else exact[h, k, v - 2]
-                                        if not last:
-                                            reference[g, k, v] += value
-                                            for q in range(3):
-                                                slope[g, k, q, v] += t[q] * value
-                                        else:
-                                            off = value - reference[g, k, v]
-                                            for q in range(3):
-                                                off -= t[q] * slope[g, k, q, v]
-                                            loose[g, k, v] = max(loose[g, k, v], abs(off) * (1.0 + 1e-6) + 1e-6)
-                    if not last:
-                        held = (high[0] - low[0] + 1) * (high[1] - low[1] + 1) * (high[2] - low[2] + 1)
-                        for k in range(n):
-                            for v in range(2 + turning):
-                                reference[g, k, v] /= held
-                                for q in range(3):
-                                    slope[g, k, q, v] /= max(squares[q], 1e-9)
-                            for v in range(2 + turning, 2 + c):
-                                reference[g, k, v] = exact[(a * counts[1] + b) * counts[2] + d, k, v - 2]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -312,7 +263,10 @@ def _choose_squares(extent, block_level, places, chosen):  # type: ignore[no-unt
                 down = right = 0
                 if shift <= block_level:
                     covered += (1 << shift) - 1
-                    down, right = (extent[g, k, 0] + base) & ((1 << shift) - 1), (extent[g, k, 2] + base) & ((1 << shift) - 1)
+                    down, right = (
+                        (extent[g, k, 0] + base) & ((1 << shift) - 1),
+                        (extent[g, k, 2] + base) & ((1 << shift) - 1),
+                    )
                 if down + rows <= covered and right + columns <= covered:
                     chosen[g, k] = l
                     break

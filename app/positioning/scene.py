@@ -47,7 +47,7 @@ def make_scene(
     turn = _turn(window)[order]
     scene = Scene(
         plane.mean_uT, plane.variance_uT2, plane.pyramid.records, plane.pyramid.records.view(np.uint8),
-        plane.pyramid.places, np.array(plane.pyramid.doubling), plane.pyramid.tangents, plane.pyramid.tangent_first,
+        plane.pyramid.places, np.array(plane.pyramid.doubling),
         np.zeros((0, 0), dtype=np.int64) if walkable is None else _summed(walkable), noise, kind,
         ladder, constant, inflation, least, cells, turn, bool(window.turns and len(window.tilt)),
         (precision is not None, precision or 0.0, weight, c * math.log(lightest / weight)),

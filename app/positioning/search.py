@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.positioning.course_tree import CourseTree, course_tree
-from app.positioning.descent import bound_nodes, dive, sift, split_nodes, top_nodes
+from app.positioning.descent import dive, split, top, top_nodes
 from app.positioning.floors import Plane
 from app.positioning.kernels import Scene
 from app.positioning.lattice import Courses, ReducedWindow, turn_window
@@ -34,7 +34,7 @@ _NODES_PER_POSE = 2  # how many nodes of a level may be followed, per pose of th
 _TOP, _OFFSET_TOP = 4, 4  # levels to start from: what larger blocks hold is hardly ever excluded
 _SHARE = 1.0  # of a block's side, by which a group of courses may spread the samples
 _BEAM = 16
-_WIDE, _OFFSET_WIDE = 100, 1000
+_WIDE = 300
 _DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _CHUNK = 4_000  # nodes split between two looks at the caller's patience
@@ -71,36 +71,36 @@ class _OnPlane:
         self.scene, self.courses, self.compared, self.top = scene, tree, compared, top
         self.tree = tree.tree
         self.ny, self.nx = scene.mean.shape[0] - 2, scene.mean.shape[1] - 2
-
-    def top_nodes(self) -> tuple[Nodes, Array]:
-        stage, side = self.courses.stages[self.top], 1 << self.top
-        middle = self.tree.middle[stage.first : stage.last]
+        self.stage = tree.stages[top]
+        middle, side = self.tree.middle[self.stage.first : self.stage.last], 1 << top
         row, column = (int(middle[:, k].min()) // side * side for k in (0, 2))
         height = (self.ny - 1 + int(middle[:, 1].max()) - row) // side + 1
         width = (self.nx - 1 + int(middle[:, 3].max()) - column) // side + 1
-        nodes: Nodes
-        costs: Array
-        nodes, costs = top_nodes(stage.first, stage.last, self.top, row, column, height, width, self.tree, self.scene)
-        return nodes, costs
+        self.area = row, column, height, width
 
-    def split(self, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array, Array]:
-        """The parts of nodes one level down, their prior costs, and the bounds of what they are parts of."""
-        parts: Nodes
-        costs: Array
-        known: Array
-        parts, costs, known = split_nodes(nodes, bounds, level, self.tree, self.scene)
-        return parts, costs, known
+    def start(self, first: int, last: int, best: float, window: float) -> tuple[Nodes, Array, int, float]:
+        """Top nodes of some groups that may matter, their bounds, the values compared, and the mass the others hold."""
+        nodes, bounds, used, missed = top(first, last, self.top, self.area, self.tree, self.scene, best, window)
+        return nodes, bounds, int(used) * self.compared, float(missed)
 
-    def bound(
-        self, nodes: Nodes, costs: Array, level: int, best: float, window: float, allowed: int
-    ) -> tuple[int, int]:
-        """Turn prior costs into bounds, of as many nodes as allowed; returns how many, and the values compared."""
-        done, used = bound_nodes(nodes, costs, level, self.tree, self.scene, best, window, allowed // self.compared)
-        return int(done), int(used) * self.compared
+    def split(
+        self, nodes: Nodes, level: int, best: float, window: float, allowed: int
+    ) -> tuple[Nodes, Array, int, int, float, float]:
+        """The parts of nodes that may matter, their bounds, how many nodes were split with as many comparisons as allowed,
+        the values compared, the mass other parts hold, and the least cost of a part."""
+        parts, bounds, done, used, missed, least = split(
+            nodes, level, self.tree, self.scene, best, window, allowed // self.compared
+        )
+        return parts, bounds, int(done), int(used) * self.compared, float(missed), float(least)
 
-    def dive(self, nodes: Nodes, bounds: Array, level: int, best: float) -> tuple[Nodes, float]:
+    def seed(self) -> tuple[Nodes, float]:
+        """A good pose (1, 3) of the plane and its cost; none (0, 3) if it has none."""
+        nodes, costs = top_nodes(self.stage.first, self.stage.last, self.top, self.area, self.tree, self.scene)
+        return self.dive(nodes, costs, self.top, np.inf, wide=len(nodes))
+
+    def dive(self, nodes: Nodes, bounds: Array, level: int, best: float, wide: int) -> tuple[Nodes, float]:
         """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds one."""
-        beam, wide = _BEAM, _OFFSET_WIDE if self.scene.offset[0] else _WIDE
+        beam = _BEAM
         while True:
             pose, cost = dive(nodes, bounds, level, max(wide, beam), beam, self.tree, self.scene, best)
             if len(pose) or beam >= len(nodes):
@@ -224,13 +224,11 @@ class _Patience:
 
 @dataclass(slots=True, eq=False)
 class _Start:
-    """The top nodes of a plane with their bounds, and what these took of the budget; a pose (1, 3) that was found."""
+    """The top nodes of a plane that may matter with their bounds, and what these took of the budget."""
 
     nodes: Nodes
     bounds: Array
     used: int
-    seed: Nodes
-    seed_cost: float
 
     @property
     def least(self) -> float:
@@ -256,70 +254,56 @@ class _Sweep:
 
     def over(self, on_planes: Sequence[_OnPlane]) -> list[tuple[Nodes, Array]]:
         """Per plane the poses within the window of the best so far, with their costs; the most promising plane first."""
-        starts = [self._start(on_plane) for on_plane in on_planes]
-        if not self.assumed:
-            for on_plane, start in zip(on_planes, starts, strict=True):
-                self._seed(on_plane, start, start.nodes, start.bounds, on_plane.top)
-            for on_plane, start in zip(on_planes, starts, strict=True):
-                start.bounds[:], used = self._bound(on_plane, start.nodes)
-                start.used += used
         found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(on_planes)
+        if not self.assumed:
+            found = [self._seed(on_plane) for on_plane in on_planes]
+        starts = [self._start(on_plane) for on_plane in on_planes]
         for k in np.argsort([start.least for start in starts], kind="stable"):
-            found[k] = self._run(on_planes[k], starts[k])
+            found[k] = self._run(on_planes[k], starts[k], *found[k])
         return found
 
-    def _start(self, on_plane: _OnPlane) -> _Start:
-        nodes, bounds = on_plane.top_nodes()
-        if not self.assumed:
-            return _Start(nodes, bounds, 0, np.empty((0, 3), np.int32), np.inf)
-        bounds, used = self._bound(on_plane, nodes)
-        return _Start(nodes, bounds, used, np.empty((0, 3), np.int32), np.inf)
-
-    def _seed(self, on_plane: _OnPlane, start: _Start, nodes: Nodes, bounds: Array, level: int) -> None:
-        """Follow the most promising nodes down to a pose."""
-        pose, cost = on_plane.dive(nodes, bounds, level, self.best)
-        if cost < self.best:
-            start.seed, start.seed_cost = pose, cost
+    def _seed(self, on_plane: _OnPlane) -> tuple[Nodes, Array]:
+        pose, cost = on_plane.seed()
+        if len(pose):
             self._improve(cost)
+        return pose, np.full(len(pose), cost)
 
-    def _run(self, on_plane: _OnPlane, start: _Start) -> tuple[Nodes, Array]:
+    def _start(self, on_plane: _OnPlane) -> _Start:
+        """The top nodes that may matter; groups that are not reached in time are left out, by what their priors cost."""
+        found, used, at, stage = [], 0, on_plane.stage.first, on_plane.stage
+        step = max(8 * _CHUNK // (on_plane.area[2] * on_plane.area[3]), 1)
+        while at < stage.last and not self.patience.over():
+            nodes, bounds, compared, missed = on_plane.start(at, min(at + step, stage.last), self.best, self.window)
+            found.append((nodes, bounds))
+            used, at, self.missed_mass = used + compared, at + step, self.missed_mass + missed
+        if at < stage.last:
+            left = on_plane.tree.cost[at : stage.last] + on_plane.scene.constant
+            self.miss(on_plane.tree.leaves[at : stage.last] * float(on_plane.ny * on_plane.nx), left)
+            self.reach = min(self.reach, float(left.min()))
+        return _Start(*_joined(found), used)
+
+    def _run(self, on_plane: _OnPlane, start: _Start, seed: Nodes, seed_cost: Array) -> tuple[Nodes, Array]:
         nodes, bounds, left = start.nodes, start.bounds, self.budget - start.used
         for level in range(on_plane.top - 1, -1, -1):
             nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
             if len(nodes) > _DIVE_AGAIN or (self.assumed and len(nodes) > _BEAM):
-                self._seed(on_plane, start, nodes, bounds, level + 1)
+                pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best, _WIDE)
+                if cost < self.best:
+                    seed, seed_cost = pose, np.array([cost])
+                    self._improve(cost)
             nodes, bounds, used = self._split(on_plane, nodes, bounds, level, max(left, 0) // (level + 1))
             left -= used
         self.used = max(self.used, self.budget - left)
-        return self._poses(nodes, bounds, start)
+        if len(seed) and not (nodes == seed).all(axis=1).any():
+            nodes, bounds = np.concatenate([seed, nodes]), np.concatenate([seed_cost, bounds])
+        keep = self._keep(bounds, self.capacity)
+        self.miss(np.ones(len(bounds) - int(keep.sum())), bounds[~keep])
+        return nodes[keep], bounds[keep]
 
     def miss(self, poses: Array, bounds: Array) -> None:
         """Count nodes of so many poses that are left out, by their bounds."""
         near = bounds < self.best + 2.0 * _NEGLIGIBLE_NATS
         self.missed_mass += float(poses[near] @ np.exp(np.minimum(0.5 * (self.best - bounds[near]), 300.0)))
-
-    def _poses(self, nodes: Nodes, costs: Array, start: _Start) -> tuple[Nodes, Array]:
-        """What is left at the end, and the seed."""
-        seeded = (nodes == start.seed).all(axis=1) if len(start.seed) else np.zeros(len(nodes), dtype=np.bool_)
-        if len(start.seed) and not seeded.any():
-            nodes, costs = np.concatenate([start.seed, nodes]), np.append(start.seed_cost, costs)
-        if not len(nodes):
-            return nodes, costs
-        self._improve(float(costs.min()))
-        keep = self._keep(costs, self.capacity)
-        self.miss(np.ones(len(costs) - int(keep.sum())), costs[~keep])
-        return nodes[keep], costs[keep]
-
-    def _bound(self, on_plane: _OnPlane, nodes: Nodes) -> tuple[Array, int]:
-        """Bounds of top nodes, of those not reached in time what they cost by their priors; and the values compared."""
-        bounds = on_plane.top_nodes()[1]
-        used = 0
-        for first in range(0, len(nodes), 8 * _CHUNK):
-            if self.patience.over():
-                break
-            part = slice(first, first + 8 * _CHUNK)
-            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, self.best, self.window, _ENDLESS)[1]
-        return bounds, used
 
     def _split(
         self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int, allowed: int
@@ -331,24 +315,18 @@ class _Sweep:
         if on_plane.most(nodes) > allowed:
             order = np.argsort(bounds, kind="stable")
             nodes, bounds = nodes[order], bounds[order]
-        found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))]
+        found: list[tuple[Nodes, Array]] = []
         done = used = 0
         while done < len(nodes) and used < allowed and not self.patience.over():
-            part = slice(done, done + _CHUNK)
-            parts, costs, known = on_plane.split(nodes[part], bounds[part], level)
-            reached, compared = on_plane.bound(parts, costs, level, self.best, self.window, allowed - used)
-            if reached < len(parts):
-                self._leave(on_plane, parts[reached:], known[reached:], level)
-            if level == 0 and reached:
-                self._improve(float(costs[:reached].min()))
-            *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best, self.window)
+            part = nodes[done : done + _CHUNK]
+            *kept, split, compared, missed, least = on_plane.split(part, level, self.best, self.window, allowed - used)
             found.append((kept[0], kept[1]))
-            done, used, self.missed_mass = done + _CHUNK, used + compared, self.missed_mass + missed
+            done, used, self.missed_mass = done + split, used + compared, self.missed_mass + missed
+            if level == 0:
+                self._improve(least)
         if done < len(nodes):
             self._leave(on_plane, nodes[done:], bounds[done:], level + 1)
-        if len(found) == 2:
-            return *found[1], used
-        return np.concatenate([parts for parts, _ in found]), np.concatenate([costs for _, costs in found]), used
+        return *_joined(found), used
 
     def _leave(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> None:
         """Leave out nodes that were not reached: the window ends where they may begin."""
@@ -356,9 +334,7 @@ class _Sweep:
         self.reach = min(self.reach, float(bounds.min()))
 
     def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
-        """Those within the window; it shrinks when they are more than there is room for."""
-        nodes, bounds, missed = on_plane.sift(nodes, bounds, level, self.best, self.window)
-        self.missed_mass += missed
+        """No more than there is room for: the window shrinks."""
         if len(nodes) > _NODES_PER_POSE * self.capacity:
             keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
             self.miss(on_plane.poses(nodes[~keep], level), bounds[~keep])
@@ -382,3 +358,11 @@ class _Sweep:
         keep[:] = False
         keep[chosen] = True
         return keep
+
+
+def _joined(parts: list[tuple[Nodes, Array]]) -> tuple[Nodes, Array]:
+    if len(parts) == 1:
+        return parts[0]
+    if not parts:
+        return np.empty((0, 3), np.int32), np.empty(0)
+    return np.concatenate([nodes for nodes, _ in parts]), np.concatenate([bounds for _, bounds in parts])
