@@ -4,8 +4,6 @@ Nodes are (group, first row, first column) of a block for the middle sample. The
 batches that stay in the processor's caches; only those that are to be followed are kept.
 """
 
-import math
-
 import numba
 import numpy as np
 
@@ -16,6 +14,8 @@ __all__ = ["dive", "split", "top", "top_nodes"]
 
 _BATCH = 512
 _NEGLIGIBLE = 120.0  # twice the nats below the best pose from which mass does not count
+_STEPS = 4  # to a unit of cost, in which masses are rounded up
+_MASS = np.exp(-0.5 / _STEPS * np.arange(int(_NEGLIGIBLE) * _STEPS + 1))  # by steps of cost above the best
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -69,7 +69,7 @@ def _batch(nodes, costs, count, level, tree, scene, best, window, kept, bounds, 
             kept[found, 0], kept[found, 1], kept[found, 2], bounds[found] = g, nodes[p, 1], nodes[p, 2], bound
             found += 1
         elif bound < best + _NEGLIGIBLE:
-            missed += leaves[g] * cells * math.exp(min(0.5 * (best - bound), 300.0))
+            missed += leaves[g] * cells * _MASS[int((bound - best) * _STEPS)]
     return kept, bounds, found, work, missed, least
 
 

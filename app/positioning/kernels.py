@@ -111,7 +111,7 @@ def _term(squared, low, high, ladder, kind, c):  # type: ignore[no-untyped-def]
     return c * (1.0 + math.log(squared / ladder[kind, 0, 0]))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
 def plain_bounds(nodes, costs, level, tree, scene, best, window):  # type: ignore[no-untyped-def]
     """Add to the prior costs (k,) of nodes (k, 3) what their poses cost at least, given up beyond their `limit_of`.
 
@@ -121,12 +121,18 @@ def plain_bounds(nodes, costs, level, tree, scene, best, window):  # type: ignor
     records, codes, places = scene.records, scene.codes, scene.places
     n, c = feature.shape[1], feature.shape[2] // 2
     spare, square = spare_cost(level, scene.mean), scene.doubling[level]
+    prior_costs, stops = costs.copy(), np.empty(len(nodes))
+    followed, count = np.arange(len(nodes)), len(nodes)
+    for p in range(count):
+        stops[p] = limit_of(tree.size[nodes[p, 0]], spare, best, window)
     work = 0
-    for p in range(len(nodes)):
-        g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
-        known, stop = cost, limit_of(tree.size[g], spare, best, window)
-        for k in range(n):
-            at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], square), places)
+    for k in range(n):  # sample after sample, so that lookups do not wait for what the node before comes to
+        work += count
+        left = 0
+        for q in range(count):
+            p = followed[q]
+            g = nodes[p, 0]
+            at = record_of(nodes[p, 1] + place[g, k, 0], nodes[p, 2] + place[g, k, 1], max(place[g, k, 2], square), places)
             if c == 3:
                 x = max(max(feature[g, k, 0] - records[at, 3], records[at, 0] - feature[g, k, 3]), NOTHING)
                 y = max(max(feature[g, k, 1] - records[at, 4], records[at, 1] - feature[g, k, 4]), NOTHING)
@@ -137,11 +143,14 @@ def plain_bounds(nodes, costs, level, tree, scene, best, window):  # type: ignor
                 for m in range(c):
                     x = max(max(feature[g, k, m] - records[at, c + m], records[at, m] - feature[g, k, c + m]), NOTHING)
                     squared += x * x
-            cost += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder, kind[k], c)
-            work += 1
-            if cost > stop:
-                break
-        costs[p] = cost - SLACK * (1.0 + cost - known) - ROUNDING * abs(cost)
+            costs[p] += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder, kind[k], c)
+            followed[left] = p
+            left += costs[p] <= stops[p]
+        count = left
+        if not count:
+            break
+    for p in range(len(nodes)):
+        costs[p] -= SLACK * (1.0 + costs[p] - prior_costs[p]) + ROUNDING * abs(costs[p])
     return work
 
 

@@ -164,7 +164,7 @@ def offset_bounds(nodes, costs, level, tree, scene, best, window):  # type: igno
     """As `plain_bounds`."""
     place, feature, heading, kind, ladder = tree.place, tree.feature, tree.heading, scene.kind, scene.ladder
     records, codes, places, turn = scene.records, scene.codes, scene.places, scene.turn
-    n, c = feature.shape[1], feature.shape[2] // 2
+    n = feature.shape[1]
     box, weight = np.zeros((n, 6)), np.empty(n)
     spare, square = spare_cost(level, scene.mean), scene.doubling[level]
     work = 0

@@ -111,19 +111,12 @@ class _OnPlane:
         """Values compared at most to split nodes."""
         g = nodes[:, 0]
         parts = int(np.maximum(self.tree.first[g + 1] - self.tree.first[g], 1).sum())
-        return 4 * parts * self.compared * self.tree.feature.shape[1]
-
-    def sift(self, nodes: Nodes, bounds: Array, level: int, best: float, window: float) -> tuple[Nodes, Array, float]:
-        """The nodes that may matter, and the mass, relative to a pose of cost `best`, of the others at most."""
-        left: Nodes
-        least: Array
-        left, least, missed = sift(nodes, bounds, level, self.tree, self.scene, best, window)
-        return left, least, float(missed)
+        return 4 * parts * self.compared * int(self.tree.feature.shape[1])
 
     def poses(self, nodes: Nodes, level: int) -> Array:
         """How many poses nodes hold at most."""
         side = 1 << level
-        return self.tree.leaves[nodes[:, 0]] * float(min(side, self.ny) * min(side, self.nx))
+        return np.asarray(self.tree.leaves[nodes[:, 0]] * float(min(side, self.ny) * min(side, self.nx)))
 
     def last_cells(self, poses: Nodes) -> Nodes:
         """(course, row, column) of the last sample."""
@@ -278,14 +271,14 @@ class _Sweep:
             used, at, self.missed_mass = used + compared, at + step, self.missed_mass + missed
         if at < stage.last:
             left = on_plane.tree.cost[at : stage.last] + on_plane.scene.constant
-            self.miss(on_plane.tree.leaves[at : stage.last] * float(on_plane.ny * on_plane.nx), left)
+            self.miss(np.asarray(on_plane.tree.leaves[at : stage.last] * float(on_plane.ny * on_plane.nx)), left)
             self.reach = min(self.reach, float(left.min()))
         return _Start(*_joined(found), used)
 
     def _run(self, on_plane: _OnPlane, start: _Start, seed: Nodes, seed_cost: Array) -> tuple[Nodes, Array]:
         nodes, bounds, left = start.nodes, start.bounds, self.budget - start.used
         for level in range(on_plane.top - 1, -1, -1):
-            nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
+            nodes, bounds = self._fit(on_plane, nodes, bounds, level + 1)
             if len(nodes) > _DIVE_AGAIN or (self.assumed and len(nodes) > _BEAM):
                 pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best, _WIDE)
                 if cost < self.best:
@@ -319,9 +312,11 @@ class _Sweep:
         done = used = 0
         while done < len(nodes) and used < allowed and not self.patience.over():
             part = nodes[done : done + _CHUNK]
-            *kept, split, compared, missed, least = on_plane.split(part, level, self.best, self.window, allowed - used)
-            found.append((kept[0], kept[1]))
-            done, used, self.missed_mass = done + split, used + compared, self.missed_mass + missed
+            parts, costs, reached, compared, missed, least = on_plane.split(
+                part, level, self.best, self.window, allowed - used
+            )
+            found.append((parts, costs))
+            done, used, self.missed_mass = done + reached, used + compared, self.missed_mass + missed
             if level == 0:
                 self._improve(least)
         if done < len(nodes):
@@ -333,7 +328,7 @@ class _Sweep:
         self.miss(on_plane.poses(nodes, level), bounds)
         self.reach = min(self.reach, float(bounds.min()))
 
-    def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
+    def _fit(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
         """No more than there is room for: the window shrinks."""
         if len(nodes) > _NODES_PER_POSE * self.capacity:
             keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
