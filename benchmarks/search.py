@@ -254,7 +254,9 @@ def same_set(scan: ExhaustiveScan, turned: Turned, near: np.ndarray, found: Cand
     return surely <= got <= perhaps and bool(best <= exact.min() + rounding) and found.complete
 
 
-def timed(planes: Sequence[Plane], window: ReducedWindow, courses: Courses, error: WindowError, nats: float) -> tuple[Candidates, float]:
+def timed(
+    planes: Sequence[Plane], window: ReducedWindow, courses: Courses, error: WindowError, nats: float
+) -> tuple[Candidates, float]:
     start = process_time()
     found = search(planes, window, courses, PosePrior(), error, window_nats=nats)
     return found, process_time() - start
@@ -266,7 +268,10 @@ def plain_case(rng: np.random.Generator, grid: FieldGrid, plane: Plane, given: a
     fast, compiled, whole_array, same = [], [], [], 0
     for k in range(-1, given.windows):  # one more, first, to compile
         asked = random_window(rng, grid)
-        window, courses = reduce_window(asked, "vector", RESOLUTION_M), single_course(heading_lattice(asked, 2 * np.pi / HEADINGS))
+        window, courses = (
+            reduce_window(asked, "vector", RESOLUTION_M),
+            single_course(heading_lattice(asked, 2 * np.pi / HEADINGS)),
+        )
         turned = turn_window(window, courses, RESOLUTION_M)
         found, took = timed([plane], window, courses, plain_error(len(window)), given.nats)
         start = process_time()
@@ -287,7 +292,9 @@ def plain_case(rng: np.random.Generator, grid: FieldGrid, plane: Plane, given: a
     return passed & report_ratio("compiled", compiled, fast, given.compiled_target)
 
 
-def offset_case(rng: np.random.Generator, grid: FieldGrid, plane: Plane, given: argparse.Namespace, inflation: float) -> bool:
+def offset_case(
+    rng: np.random.Generator, grid: FieldGrid, plane: Plane, given: argparse.Namespace, inflation: float
+) -> bool:
     """Headings, step scales and heading drifts, an offset integrated out."""
     fast, compiled, same, sizes = [], [], 0, []
     for k in range(-1, given.windows):
@@ -310,11 +317,15 @@ def offset_case(rng: np.random.Generator, grid: FieldGrid, plane: Plane, given: 
     passed = report_search(fast, same, given.offset_scans)
     passed &= report_ratio("compiled", compiled, fast[: len(compiled)], given.compiled_target)
     most = float(np.percentile(1e3 * np.array(fast), 95))
-    print(f"95 % below               {most:7.1f} ms (target {given.offset_ms:g} ms)  {verdict(most <= given.offset_ms)}")
+    print(
+        f"95 % below               {most:7.1f} ms (target {given.offset_ms:g} ms)  {verdict(most <= given.offset_ms)}"
+    )
     return passed and most <= given.offset_ms
 
 
-def erring(rng: np.random.Generator, grid: FieldGrid, plane: Plane, inflation: float) -> tuple[ReducedWindow, Courses, WindowError]:
+def erring(
+    rng: np.random.Generator, grid: FieldGrid, plane: Plane, inflation: float
+) -> tuple[ReducedWindow, Courses, WindowError]:
     asked = random_window(rng, grid, erring=True)
     window = reduce_window(asked, "vector", RESOLUTION_M)
     error = dataclasses.replace(plain_error(len(window), OFFSET_SD_UT**-2), inflation=inflation)
@@ -323,7 +334,9 @@ def erring(rng: np.random.Generator, grid: FieldGrid, plane: Plane, inflation: f
     return window, course_lattice(asked, steps, SCALE_SD, DRIFT_SD_RAD_PER_M), error
 
 
-def growth(rng: np.random.Generator, grids: Sequence[FieldGrid], planes: Sequence[Plane], given: argparse.Namespace) -> bool:
+def growth(
+    rng: np.random.Generator, grids: Sequence[FieldGrid], planes: Sequence[Plane], given: argparse.Namespace
+) -> bool:
     """Cost of a search over more floors, one of them walked, relative to that floor alone."""
     windows = min(given.windows, 30)
     print("\ncost with more floors, relative to one")

@@ -1,8 +1,8 @@
 """Sliding-window bounds of a gridded field: the smallest and largest value in any square of 2^l cells.
 
-Level l answers for the square of side s = 2^l whose first cell is (j, i), wherever that lies: one lookup whatever the
-displacement of a block of poses. Starts are kept every q = max(1, s / 4) cells, for squares that much larger, so that
-high levels stay small enough for the processor's caches. Cells off the grid hold the prior. Variances are kept as
+A level answers for the square of side s whose first cell is (j, i), wherever that lies: one lookup whatever the
+displacement of a block of poses. Sides are the powers of two and steps of a quarter between them, for poses that are not
+displaced alike. Starts are kept every q = max(1, s / 4) cells, for squares that much larger, so that high levels stay small enough for the processor's caches. Cells off the grid hold the prior. Variances are kept as
 one-byte codes of a logarithmic ladder, rounded outwards, beside the bounds of the mean in the same record. All levels
 lie in one array, so that a search may take each of its lookups from another level; a last record covers everything.
 """
@@ -44,16 +44,18 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """levels[l - 1] holds squares of 2^l cells; ladder_uT2 (LADDER_STEPS,) ascends from the smallest variance.
+    """levels by ascending side; ladder_uT2 (LADDER_STEPS,) ascends from the smallest variance.
 
     records   (k, width) of all levels, row by row, the smallest squares first, then one that covers all cells
-    places    (levels + 1, 5) where a level's lie among them: base, log2 of its step, height, width, first record
+    places    (levels + 1, 6) where a level's lie among them: base, log2 of its step, height, width, first record, side
+    doubling  index of the level of side 2^l at l, from one; a search may start from blocks of the last
     """
 
     levels: tuple[Level, ...]
     ladder_uT2: Array
     records: Float32
     places: NDArray[np.int64]
+    doubling: tuple[int, ...]
 
     @property
     def nbytes(self) -> int:
@@ -76,27 +78,43 @@ def build_pyramid(mean_uT: Float32, variance_uT2: Float32, levels: int) -> Pyram
     whole = np.concatenate([mean_uT.min(axis=(0, 1)), mean_uT.max(axis=(0, 1))])[None, None]
     extremes = np.array([codes[..., 0].min(), codes[..., 1].max()], dtype=np.uint8)[None, None]
     built = []
-    for level in range(1, levels + 1):
-        side = 1 << level
-        bounds, codes = _doubled(bounds, side), _doubled(codes, side)
-        step = max(1, side // 4)
+    below = 1
+    for side, step in _squares(levels):
+        bounds, codes = _widened(bounds, below, side), _widened(codes, below, side)
         built.append((side, step, _records(_thinned(bounds, side, step), _thinned(codes, side, step))))
+        below = side
     return _gathered(built, _records(whole, extremes), ladder)
+
+
+def _squares(levels: int) -> list[tuple[int, int]]:
+    """Sides, from two to twice 2^levels, and steps."""
+    squares = []
+    for side in (1 << level for level in range(1, levels + 1)):
+        step = max(1, side // 4)
+        squares.append((side, step))
+        if side == 4:
+            squares.append((6, 2))
+        if side > 4:
+            squares += [(side * quarters // 4, step) for quarters in (5, 6, 7)]
+    return [*squares, (2 << levels, max(1, (2 << levels) // 4))]
 
 
 def _gathered(built: list[tuple[int, int, Float32]], whole: Float32, ladder: Array) -> Pyramid:
     """Levels, as (side, step, records), and the record of everything in one array."""
     places, first = [], 0
     for side, step, own in built:
-        places.append((side + step, step.bit_length() - 1, own.shape[0], own.shape[1], first))
+        places.append((side + step, step.bit_length() - 1, own.shape[0], own.shape[1], first, side))
         first += own.shape[0] * own.shape[1]
-    places.append((0, 0, 1, 1, first))
+    places.append((0, 0, 1, 1, first, 0))
     records = np.concatenate([own.reshape(-1, own.shape[2]) for own in (*(own for _, _, own in built), whole)])
     levels = tuple(
-        Level(side, step, records[start : start + height * width].reshape(own.shape))
-        for (side, step, own), (_, _, height, width, start) in zip(built, places, strict=False)
+        Level(side, step, records[place[4] : place[4] + place[2] * place[3]].reshape(own.shape))
+        for (side, step, own), place in zip(built, places, strict=False)
     )
-    return Pyramid(levels, ladder, records, np.array(places, dtype=np.int64))
+    table = np.array(places, dtype=np.int64)
+    sides = [side for side, _, _ in built]
+    doubling = tuple(sides.index(1 << level) for level in range(1, (sides[-1] // 2).bit_length()))
+    return Pyramid(levels, ladder, records, table, (0, *doubling))
 
 
 def _records(bounds: Float32, codes: Codes) -> Float32:
@@ -117,11 +135,11 @@ def _codes(variance: Array, ladder: Array) -> Codes:
     return codes
 
 
-def _doubled(below: _Cells, side: int) -> _Cells:
-    """Every square of `side` cells, starts -side to n, from every square of half the side."""
-    half = side // 2
-    above = np.empty((below.shape[0] + half, below.shape[1] + half, below.shape[2]), dtype=below.dtype)
-    _cover(below, above, 1, -half, half)
+def _widened(below: _Cells, before: int, side: int) -> _Cells:
+    """Every square of `side` cells, starts -side to n, from every square of side `before`, at least half of that."""
+    more = side - before
+    above = np.empty((below.shape[0] + more, below.shape[1] + more, below.shape[2]), dtype=below.dtype)
+    _cover(below, above, 1, -more, more)
     return above
 
 

@@ -27,12 +27,13 @@ class Tree(NamedTuple):
     """All groups of all stages; the courses, each on its own, come first, as groups 0 to h - 1.
 
     place     (g, n, 3) per sample: first row and first column of the group's displacements from the middle cell, and
-              the level of squares, from one, that covers a block so displaced; of a course alone: that of the block
+              the index of the squares that cover a block so displaced; of a course alone zero: those of the block
     feature   (g, n, 2 c) lower, then upper bounds of the features, uT
     exact     (h, n, c) features of the courses, uT
     middle    (g, 4) least and largest row, least and largest column of the middle sample from the last
     heading   (g, 2) cosine and sine of one of its headings
     cost      (g,) least -2 log prior
+    typical   (g,) a course in the middle of the group
     leaves    (g,) courses held
     size      (g,) twice the log of it
     first     (g + 1,) where a group's parts in the stage below begin in `part`
@@ -45,6 +46,7 @@ class Tree(NamedTuple):
     middle: Index
     heading: Array
     cost: Array
+    typical: Index
     leaves: Index
     size: Array
     first: Index
@@ -79,7 +81,7 @@ def course_tree(
     share: float,
     headings_apart: bool,
 ) -> CourseTree:
-    """Groups for blocks up to 2^top cells, for the levels of squares `places` of a pyramid.
+    """Groups for blocks up to 2^top cells, for the squares `places` of a pyramid.
 
     order           in which the samples are compared
     middle_sample   the one that displacements count from
@@ -102,7 +104,7 @@ def course_tree(
     exact = np.ascontiguousarray(turned.features_uT[:, order])
     middle, cost = np.empty((groups, 4), dtype=np.int32), np.empty(groups)
     leaves, first = np.ones(groups, dtype=np.int32), np.zeros(groups + 1, dtype=np.int32)
-    level = np.zeros((groups, n), dtype=np.int32)
+    level, typical = np.zeros((groups, n), dtype=np.int32), np.arange(groups, dtype=np.int32)
     _leaves(offset, exact, order, middle_sample, extent, feature, middle)
     cost[: len(courses)] = -2.0 * courses.log_prior
     heading = np.empty((groups, 2))
@@ -120,13 +122,16 @@ def course_tree(
                 start, first[start : start + size + 1] - first[start], parts[-1], extent, feature, middle, cost, leaves
             )
             heading[start : start + size] = heading[parts[-1][first[start : start + size] - first[start]]]
-            _choose_level(extent[start : start + size], l, places, level[start : start + size])
+            held = first[start : start + size] - first[start]
+            typical[start : start + size] = typical[parts[-1][held + counted // 2]]
+            _choose_squares(extent[start : start + size], l, places, level[start : start + size])
         stages.append(stage)
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
     part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
     return CourseTree(
-        Tree(place, feature, exact, middle, heading, cost, leaves, 2.0 * np.log(leaves), first, part), tuple(stages)
+        Tree(place, feature, exact, middle, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, part),
+        tuple(stages),
     )
 
 
@@ -245,22 +250,23 @@ def _join(start, first, part, extent, feature, middle, cost, leaves):  # type: i
 
 
 @numba.njit(cache=True, nogil=True)
-def _choose_level(extent, block_level, places, level):  # type: ignore[no-untyped-def]
-    """Per group and sample the lowest level of squares that covers a block, whose corner is a multiple of its side,
-    anywhere in the extent; where the squares' steps are no larger than the block, their start is known exactly."""
-    side, last = 1 << block_level, len(places)
+def _choose_squares(extent, block_level, places, chosen):  # type: ignore[no-untyped-def]
+    """Per group and sample the smallest squares that cover a block, whose corner is a multiple of its side, anywhere in
+    the extent; where the squares' steps are no larger than the block, their start is known exactly."""
+    side, last = 1 << block_level, len(places) - 1
     for g in range(extent.shape[0]):
         for k in range(extent.shape[1]):
             rows, columns = side + extent[g, k, 1] - extent[g, k, 0], side + extent[g, k, 3] - extent[g, k, 2]
-            found = last
-            for l in range(block_level, last):
-                base, shift = places[l - 1, 0], places[l - 1, 1]
-                step, covered = 1 << shift, 1 << l
+            chosen[g, k] = last
+            for l in range(last):
+                base, shift, covered = places[l, 0], places[l, 1], places[l, 5]
                 down = right = 0
                 if shift <= block_level:
-                    covered += step - 1
-                    down, right = (extent[g, k, 0] + base) & (step - 1), (extent[g, k, 2] + base) & (step - 1)
+                    covered += (1 << shift) - 1
+                    down, right = (
+                        (extent[g, k, 0] + base) & ((1 << shift) - 1),
+                        (extent[g, k, 2] + base) & ((1 << shift) - 1),
+                    )
                 if down + rows <= covered and right + columns <= covered:
-                    found = l
+                    chosen[g, k] = l
                     break
-            level[g, k] = found

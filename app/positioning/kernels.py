@@ -45,6 +45,7 @@ class Scene(NamedTuple):
 
     mean, variance    (ny + 2, nx + 2, c) and (ny + 2, nx + 2): the field, with one cell of prior around
     records, codes, places   of the pyramid; codes are the records' bytes
+    doubling          of the pyramid: the squares that are blocks
     walkable          (ny + 1, nx + 1) summed-area table of cells the last sample may be in, or (0, 0): all
     noise             (n,) variance of the samples over the map's share
     kind              (n,) which ladder a sample uses
@@ -62,6 +63,7 @@ class Scene(NamedTuple):
     records: NDArray[np.float32]
     codes: NDArray[np.uint8]
     places: NDArray[np.int64]
+    doubling: NDArray[np.int64]
     walkable: NDArray[np.int64]
     noise: Array
     kind: NDArray[np.int64]
@@ -91,42 +93,46 @@ def limit_of(size, spare, best, window):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def record_of(j, i, l, places):  # type: ignore[no-untyped-def]
-    """Index of the record that covers the square of level l (from one) at (j, i)."""
-    base, shift = places[l - 1, 0], places[l - 1, 1]
-    height, width = places[l - 1, 2], places[l - 1, 3]
+    """Index of the record that covers the square at (j, i) of those with index l."""
+    base, shift = places[l, 0], places[l, 1]
+    height, width = places[l, 2], places[l, 3]
     a = min(max((j + base) >> shift, 0), height - 1)
     b = min(max((i + base) >> shift, 0), width - 1)
-    return places[l - 1, 4] + a * width + b
+    return places[l, 4] + a * width + b
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _term(squared, low, high, ladder, c):  # type: ignore[no-untyped-def]
-    """Smallest squared / v + c log(v / v_min) over the variances between two steps of `ladder` (steps, 3)."""
-    if squared >= ladder[high, 0]:
-        return squared * ladder[high, 1] + ladder[high, 2]
-    if squared <= ladder[low, 0]:
-        return squared * ladder[low, 1] + ladder[low, 2]
-    return c * (1.0 + math.log(squared / ladder[0, 0]))
+def _term(squared, low, high, ladder, kind, c):  # type: ignore[no-untyped-def]
+    """Smallest squared / v + c log(v / v_min) over the variances between two steps of a ladder."""
+    if squared >= ladder[kind, high, 0]:
+        return squared * ladder[kind, high, 1] + ladder[kind, high, 2]
+    if squared <= ladder[kind, low, 0]:
+        return squared * ladder[kind, low, 1] + ladder[kind, low, 2]
+    return c * (1.0 + math.log(squared / ladder[kind, 0, 0]))
 
 
-@numba.njit(cache=True, nogil=True)
-def plain_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
+def plain_bounds(nodes, costs, level, tree, scene, best, window):  # type: ignore[no-untyped-def]
     """Add to the prior costs (k,) of nodes (k, 3) what their poses cost at least, given up beyond their `limit_of`.
 
-    Returns how many nodes were bounded and the samples compared, hardly more than `allowed`.
+    Returns how many samples were compared.
     """
     place, feature, kind, ladder = tree.place, tree.feature, scene.kind, scene.ladder
     records, codes, places = scene.records, scene.codes, scene.places
     n, c = feature.shape[1], feature.shape[2] // 2
-    spare = spare_cost(level, scene.mean)
+    spare, square = spare_cost(level, scene.mean), scene.doubling[level]
+    prior_costs, stops = costs.copy(), np.empty(len(nodes))
+    followed, count = np.arange(len(nodes)), len(nodes)
+    for p in range(count):
+        stops[p] = limit_of(tree.size[nodes[p, 0]], spare, best, window)
     work = 0
-    for p in range(len(nodes)):
-        if work >= allowed:
-            return p, work
-        g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
-        known, stop = cost, limit_of(tree.size[g], spare, best, window)
-        for k in range(n):
-            at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
+    for k in range(n):  # sample after sample, so that lookups do not wait for what the node before comes to
+        work += count
+        left = 0
+        for q in range(count):
+            p = followed[q]
+            g = nodes[p, 0]
+            at = record_of(nodes[p, 1] + place[g, k, 0], nodes[p, 2] + place[g, k, 1], max(place[g, k, 2], square), places)
             if c == 3:
                 x = max(max(feature[g, k, 0] - records[at, 3], records[at, 0] - feature[g, k, 3]), NOTHING)
                 y = max(max(feature[g, k, 1] - records[at, 4], records[at, 1] - feature[g, k, 4]), NOTHING)
@@ -137,12 +143,15 @@ def plain_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # ty
                 for m in range(c):
                     x = max(max(feature[g, k, m] - records[at, c + m], records[at, m] - feature[g, k, c + m]), NOTHING)
                     squared += x * x
-            cost += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder[kind[k]], c)
-            work += 1
-            if cost > stop:
-                break
-        costs[p] = cost - SLACK * (1.0 + cost - known) - ROUNDING * abs(cost)
-    return len(nodes), work
+            costs[p] += _term(squared, codes[at, 8 * c], codes[at, 8 * c + 1], ladder, kind[k], c)
+            followed[left] = p
+            left += costs[p] <= stops[p]
+        count = left
+        if not count:
+            break
+    for p in range(len(nodes)):
+        costs[p] -= SLACK * (1.0 + costs[p] - prior_costs[p]) + ROUNDING * abs(costs[p])
+    return work
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -156,7 +165,7 @@ def to_sensor(x, y, z, turn, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def pose_costs(nodes, costs, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
+def pose_costs(nodes, costs, tree, scene, best, window):  # type: ignore[no-untyped-def]
     """Add to the prior costs (k,) of poses (k, 3) (course, cell of the middle sample) their own, given up
     beyond their `limit_of`.
 
@@ -169,12 +178,11 @@ def pose_costs(nodes, costs, tree, scene, best, window, allowed):  # type: ignor
     has_offset, precision, relative, least = scene.offset
     ry, rz = 0.0, 0.0
     stop = limit_of(0.0, spare_cost(0, mean), best, window)
+    floor = scene.least + noise
     work = 0
     for p in range(len(nodes)):
-        if work >= allowed:
-            return p, work
         g, j, i, cost = nodes[p, 0], nodes[p, 1], nodes[p, 2], costs[p]
-        gx, gy, gz, squares, apart, total = 0.0, 0.0, 0.0, 0.0, 0.0, precision
+        gx, gy, gz, squares, apart, total, ratios = 0.0, 0.0, 0.0, 0.0, 0.0, precision, 1.0
         if has_offset:
             cost += least
         for k in range(n):
@@ -188,7 +196,9 @@ def pose_costs(nodes, costs, tree, scene, best, window, allowed):  # type: ignor
             if c > 2:
                 rz = feature[g, k, 2] - mean[a, b, 2]
             squares += w * (rx * rx + ry * ry + rz * rz)
-            cost += c * math.log(v / (scene.least + noise[k]))
+            ratios *= v / floor[k]
+            if ratios > 1e200:
+                cost, ratios = cost + c * math.log(ratios), 1.0
             apart = squares
             if has_offset:
                 if scene.headed:
@@ -200,7 +210,8 @@ def pose_costs(nodes, costs, tree, scene, best, window, allowed):  # type: ignor
             work += 1
             if cost + apart > stop:
                 break
+        cost += c * math.log(ratios)
         if has_offset and cost + apart <= stop:
             cost += c * math.log(total / relative) - least
         costs[p] = cost + apart
-    return len(nodes), work
+    return work

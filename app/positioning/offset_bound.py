@@ -37,6 +37,13 @@ def _to_building(x, y, z, turn, k):  # type: ignore[no-untyped-def]
     )
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _scaled(linear, quadratic):  # type: ignore[no-untyped-def]
+    """2 t linear - t^2 quadratic at the best t up to two: where both vanish, their quotient is but rounding."""
+    t = min(linear / max(quadratic, 1e-300), 2.0)
+    return t * (2.0 * linear - t * quadratic) if linear > 0.0 else 0.0
+
+
 @numba.njit(cache=True, nogil=True)
 def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight, turn, n):  # type: ignore[no-untyped-def]
     """The bound from the distance vectors at offset b."""
@@ -44,7 +51,7 @@ def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight
         linear = squares + sx * bx + sy * by + sz * bz
         quadratic = squares + (sx * sx + sy * sy + sz * sz) / precision
         if linear > 0.0 and precision > 0.02 * total:
-            return linear * linear / max(quadratic, 1e-300)
+            return _scaled(linear, quadratic)
     # l_i = w_i (e_i - R_i u), so that their sum is p b
     ux, uy, uz = (sx - precision * bx) / total, (sy - precision * by) / total, (sz - precision * bz) / total
     linear, quadratic = 0.0, precision * (bx * bx + by * by + bz * bz)
@@ -60,7 +67,7 @@ def _dual(precision, bx, by, bz, squares, sx, sy, sz, total, ch, sh, box, weight
         quadratic += w * (lx * lx + ly * ly + lz * lz)
         linear += w * (min(lx * box[k, 0], lx * box[k, 3]) + min(ly * box[k, 1], ly * box[k, 4])
                        + min(lz * box[k, 2], lz * box[k, 5]))  # fmt: skip
-    return linear * linear / max(quadratic, 1e-300) if linear > 0.0 else 0.0
+    return _scaled(linear, quadratic)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -68,7 +75,7 @@ def _offset_bound(  # type: ignore[no-untyped-def]
     g,
     j,
     i,
-    level,
+    square,
     place,
     feature,
     heading,
@@ -97,7 +104,7 @@ def _offset_bound(  # type: ignore[no-untyped-def]
     hx, hy, hz = precision, precision, precision
     cost += least
     for k in range(n):
-        at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], level), places)
+        at = record_of(j + place[g, k, 0], i + place[g, k, 1], max(place[g, k, 2], square), places)
         for m in range(c):
             box[k, m] = feature[g, k, m] - records[at, c + m]
             box[k, 3 + m] = feature[g, k, c + m] - records[at, m]
@@ -153,22 +160,20 @@ def _offset_bound(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def offset_bounds(nodes, costs, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
+def offset_bounds(nodes, costs, level, tree, scene, best, window):  # type: ignore[no-untyped-def]
     """As `plain_bounds`."""
     place, feature, heading, kind, ladder = tree.place, tree.feature, tree.heading, scene.kind, scene.ladder
     records, codes, places, turn = scene.records, scene.codes, scene.places, scene.turn
-    n, c = feature.shape[1], feature.shape[2] // 2
+    n = feature.shape[1]
     box, weight = np.zeros((n, 6)), np.empty(n)
-    spare = spare_cost(level, scene.mean)
+    spare, square = spare_cost(level, scene.mean), scene.doubling[level]
     work = 0
     for p in range(len(nodes)):
-        if work >= allowed:
-            return p, work
         known, stop = costs[p], limit_of(tree.size[nodes[p, 0]], spare, best, window)
         bound, used = _offset_bound(
-            nodes[p, 0], nodes[p, 1], nodes[p, 2], level, place, feature, heading, kind, ladder, records, codes, places, turn,
+            nodes[p, 0], nodes[p, 1], nodes[p, 2], square, place, feature, heading, kind, ladder, records, codes, places, turn,
             scene.headed, scene.offset, known, stop, box, weight,
         )  # fmt: skip
         costs[p] = bound - SLACK * (1.0 + bound - known) - ROUNDING * abs(bound)
         work += used
-    return len(nodes), work
+    return work

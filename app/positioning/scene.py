@@ -15,6 +15,8 @@ from app.positioning.window_error import WindowError
 
 __all__ = ["make_scene", "telling_order"]
 
+_BETWEEN = 15.0  # cost of a pose between those of the lattice
+
 
 def make_scene(
     plane: Plane,
@@ -37,7 +39,7 @@ def make_scene(
     floor = inflation * (least + noise)
     constant = c * float(np.log(2 * np.pi * floor).sum()) + height
     worth = n * c / error.inflation
-    usual = constant + worth + 5.0 * math.sqrt(2.0 * worth)
+    usual = constant + worth + 3.0 * math.sqrt(2.0 * worth) + _BETWEEN
     weight = float(np.sum(1.0 / floor)) + (precision or 0.0)
     lightest = float(np.sum(ladder[kind, -1, 1])) + (precision or 0.0)
     if precision is not None:  # one Gaussian factor per component is integrated out
@@ -45,7 +47,8 @@ def make_scene(
     turn = _turn(window)[order]
     scene = Scene(
         plane.mean_uT, plane.variance_uT2, plane.pyramid.records, plane.pyramid.records.view(np.uint8),
-        plane.pyramid.places, np.zeros((0, 0), dtype=np.int64) if walkable is None else _summed(walkable), noise, kind,
+        plane.pyramid.places, np.array(plane.pyramid.doubling),
+        np.zeros((0, 0), dtype=np.int64) if walkable is None else _summed(walkable), noise, kind,
         ladder, constant, inflation, least, cells, turn, bool(window.turns and len(window.tilt)),
         (precision is not None, precision or 0.0, weight, c * math.log(lightest / weight)),
     )  # fmt: skip

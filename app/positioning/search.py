@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.positioning.course_tree import CourseTree, course_tree
-from app.positioning.descent import bound_nodes, dive, sift, split_nodes, top_nodes
+from app.positioning.descent import dive, split, top, top_nodes
 from app.positioning.floors import Plane
 from app.positioning.kernels import Scene
 from app.positioning.lattice import Courses, ReducedWindow, turn_window
@@ -31,9 +31,10 @@ CAPACITY = 400_000  # poses kept at most
 BUDGET = 4_000_000_000  # values compared per plane at most: poses or nodes, times samples, times components
 _TOP_SHARE = 0.25  # of the budget, for the nodes the search starts from
 _NODES_PER_POSE = 2  # how many nodes of a level may be followed, per pose of the capacity
-_TOP, _OFFSET_TOP = 5, 4  # levels to start from: what larger blocks hold is hardly ever excluded
+_TOP, _OFFSET_TOP = 4, 4  # levels to start from: what larger blocks hold is hardly ever excluded
 _SHARE = 1.0  # of a block's side, by which a group of courses may spread the samples
 _BEAM = 16
+_WIDE = 300
 _DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _CHUNK = 4_000  # nodes split between two looks at the caller's patience
@@ -75,38 +76,38 @@ class _OnPlane:
         self.scene, self.courses, self.compared, self.top = scene, tree, compared, top
         self.tree = tree.tree
         self.ny, self.nx = scene.mean.shape[0] - 2, scene.mean.shape[1] - 2
-
-    def top_nodes(self) -> tuple[Nodes, Array]:
-        stage, side = self.courses.stages[self.top], 1 << self.top
-        middle = self.tree.middle[stage.first : stage.last]
+        self.stage = tree.stages[top]
+        middle, side = self.tree.middle[self.stage.first : self.stage.last], 1 << top
         row, column = (int(middle[:, k].min()) // side * side for k in (0, 2))
         height = (self.ny - 1 + int(middle[:, 1].max()) - row) // side + 1
         width = (self.nx - 1 + int(middle[:, 3].max()) - column) // side + 1
-        nodes: Nodes
-        costs: Array
-        nodes, costs = top_nodes(stage.first, stage.last, self.top, row, column, height, width, self.tree, self.scene)
-        return nodes, costs
+        self.area = row, column, height, width
 
-    def split(self, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array, Array]:
-        """The parts of nodes one level down, their prior costs, and the bounds of what they are parts of."""
-        parts: Nodes
-        costs: Array
-        known: Array
-        parts, costs, known = split_nodes(nodes, bounds, level, self.tree, self.scene)
-        return parts, costs, known
+    def start(self, first: int, last: int, best: float, window: float) -> tuple[Nodes, Array, int, float]:
+        """Top nodes of some groups that may matter, their bounds, the values compared, and the mass the others hold."""
+        nodes, bounds, used, missed = top(first, last, self.top, self.area, self.tree, self.scene, best, window)
+        return nodes, bounds, int(used) * self.compared, float(missed)
 
-    def bound(
-        self, nodes: Nodes, costs: Array, level: int, best: float, window: float, allowed: int
-    ) -> tuple[int, int]:
-        """Turn prior costs into bounds, of as many nodes as allowed; returns how many, and the values compared."""
-        done, used = bound_nodes(nodes, costs, level, self.tree, self.scene, best, window, allowed // self.compared)
-        return int(done), int(used) * self.compared
+    def split(
+        self, nodes: Nodes, level: int, best: float, window: float, allowed: int
+    ) -> tuple[Nodes, Array, int, int, float, float]:
+        """The parts of nodes that may matter, their bounds, how many nodes were split with as many comparisons as allowed,
+        the values compared, the mass other parts hold, and the least cost of a part."""
+        parts, bounds, done, used, missed, least = split(
+            nodes, level, self.tree, self.scene, best, window, allowed // self.compared
+        )
+        return parts, bounds, int(done), int(used) * self.compared, float(missed), float(least)
 
-    def dive(self, nodes: Nodes, bounds: Array, level: int, best: float) -> tuple[Nodes, float]:
+    def seed(self) -> tuple[Nodes, float]:
+        """A good pose (1, 3) of the plane and its cost; none (0, 3) if it has none."""
+        nodes, costs = top_nodes(self.stage.first, self.stage.last, self.top, self.area, self.tree, self.scene)
+        return self.dive(nodes, costs, self.top, np.inf, wide=len(nodes))
+
+    def dive(self, nodes: Nodes, bounds: Array, level: int, best: float, wide: int) -> tuple[Nodes, float]:
         """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds one."""
         beam = _BEAM
         while True:
-            pose, cost = dive(nodes, bounds, level, beam, self.tree, self.scene, best)
+            pose, cost = dive(nodes, bounds, level, max(wide, beam), beam, self.tree, self.scene, best)
             if len(pose) or beam >= len(nodes):
                 return pose, float(cost)
             beam *= 8
@@ -115,19 +116,12 @@ class _OnPlane:
         """Values compared at most to split nodes."""
         g = nodes[:, 0]
         parts = int(np.maximum(self.tree.first[g + 1] - self.tree.first[g], 1).sum())
-        return 4 * parts * self.compared * self.tree.feature.shape[1]
-
-    def sift(self, nodes: Nodes, bounds: Array, level: int, best: float, window: float) -> tuple[Nodes, Array, float]:
-        """The nodes that may matter, and the mass, relative to a pose of cost `best`, of the others at most."""
-        left: Nodes
-        least: Array
-        left, least, missed = sift(nodes, bounds, level, self.tree, self.scene, best, window)
-        return left, least, float(missed)
+        return 4 * parts * self.compared * int(self.tree.feature.shape[1])
 
     def poses(self, nodes: Nodes, level: int) -> Array:
         """How many poses nodes hold at most."""
         side = 1 << level
-        return self.tree.leaves[nodes[:, 0]] * float(min(side, self.ny) * min(side, self.nx))
+        return np.asarray(self.tree.leaves[nodes[:, 0]] * float(min(side, self.ny) * min(side, self.nx)))
 
     def last_cells(self, poses: Nodes) -> Nodes:
         """(course, row, column) of the last sample."""
@@ -152,15 +146,12 @@ def search(
     says so; what that leaves out is counted in `missed_mass`, and `complete` says so.
     """
     on_planes, expected = _on_planes(planes, window, courses, prior, error, budget)
-    sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget, _Patience(out_of_time))
-    starts = [sweep.start(on_plane, expected) for on_plane in on_planes]
-    ranks = np.argsort([start.least for start in starts], kind="stable")
-    for k in ranks:  # the most promising first, until a pose is as good as one that matches
-        if sweep.best > expected:
-            sweep.seed(on_planes[k], starts[k])
-    found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(planes)
-    for k in ranks:
-        found[k] = sweep.run(on_planes[k], starts[k])
+    patience = _Patience(out_of_time)
+    sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget, patience, expected)
+    found = sweep.over(on_planes)
+    if not any(len(poses) and costs.min() <= expected for poses, costs in found):  # nothing matches that well
+        sweep = _Sweep(2.0 * window_nats, capacity // len(planes), budget - sweep.used, patience, None)
+        found = sweep.over(on_planes)
     plane = np.concatenate([np.full(len(poses), k) for k, (poses, _) in enumerate(found)])
     poses = np.concatenate([on_planes[k].last_cells(poses) for k, (poses, _) in enumerate(found)]).astype(np.int64)
     cost = np.concatenate([cost for _, cost in found])
@@ -175,7 +166,7 @@ def search(
         column=poses[order, 2],
         score=-0.5 * cost[order],
         window_nats=0.5 * sweep.window,
-        complete=sweep.window == 2.0 * window_nats and not sweep.patience.ended,
+        complete=sweep.reach > sweep.best + sweep.asked and not sweep.patience.ended,
         missed_mass=sweep.missed_mass,
         poses=len(courses) * sum(p.shape[0] * p.shape[1] for p in planes),
     )
@@ -195,7 +186,7 @@ def _on_planes(
             steep = max(p.gradient_uT_per_m for p in planes) * plane.resolution_m
             trees[plane.resolution_m] = course_tree(
                 courses, turn_window(window, courses, plane.resolution_m), order, int(np.argmin(along)),
-                plane.pyramid.places, len(plane.pyramid.levels), 1.0 / max(steep, 1e-3),
+                plane.pyramid.places, len(plane.pyramid.doubling) - 1, 1.0 / max(steep, 1e-3),
                 _SHARE, scene.headed,
             )  # fmt: skip
         tree = trees[plane.resolution_m]
@@ -231,16 +222,11 @@ class _Patience:
 
 @dataclass(slots=True, eq=False)
 class _Start:
-    """The top nodes of a plane, what their priors cost, and their bounds, followed up to `followed_to`; a pose (1, 3)
-    that was found, or none."""
+    """The top nodes of a plane that may matter with their bounds, and what these took of the budget."""
 
     nodes: Nodes
-    prior_costs: Array
     bounds: Array
-    followed_to: float
     used: int
-    seed: Nodes
-    seed_cost: float
 
     @property
     def least(self) -> float:
@@ -248,69 +234,74 @@ class _Start:
 
 
 class _Sweep:
-    """Level by level over one plane after the other; the incumbent and the window carry over."""
+    """Level by level over one plane after the other; the incumbent and the window carry over.
 
-    def __init__(self, window: float, capacity: int, budget: int, patience: _Patience) -> None:
-        self.best, self.window, self.capacity = np.inf, window, max(capacity, 1)
-        self.budget, self.patience = budget, patience
+    The incumbent's cost is at first `assumed`, that of a pose which matches; without that a pose is looked for.
+    """
+
+    def __init__(self, asked: float, capacity: int, budget: int, patience: _Patience, assumed: float | None) -> None:
+        self.asked, self.capacity, self.budget, self.patience = asked, max(capacity, 1), budget, patience
+        self.assumed, self.best = assumed is not None, np.inf if assumed is None else assumed
+        self.reach = np.inf  # cost from which poses were left out for want of room, budget or time
+        self.used = 0  # of the budget, on the plane that took most
         self.missed_mass = 0.0  # at most, relative to the best pose
 
-    def start(self, on_plane: _OnPlane, expected: float) -> _Start:
-        """Bound the top nodes as far as a matching window needs it."""
-        nodes, costs = on_plane.top_nodes()
-        bounds = costs.copy()
-        used = self._bound(on_plane, nodes, bounds, expected)
-        return _Start(nodes, costs, bounds, expected, used, np.empty((0, 3), np.int32), np.inf)
+    @property
+    def window(self) -> float:
+        return max(min(self.asked, self.reach - self.best), 0.0)
 
-    def seed(self, on_plane: _OnPlane, start: _Start) -> None:
-        """Follow the most promising top nodes of a plane down to a pose."""
-        if len(start.nodes):
-            start.seed, start.seed_cost = on_plane.dive(start.nodes, start.bounds, on_plane.top, np.inf)
-            self._improve(start.seed_cost)
+    def over(self, on_planes: Sequence[_OnPlane]) -> list[tuple[Nodes, Array]]:
+        """Per plane the poses within the window of the best so far, with their costs; the most promising plane first."""
+        found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(on_planes)
+        if not self.assumed:
+            found = [self._seed(on_plane) for on_plane in on_planes]
+        starts = [self._start(on_plane) for on_plane in on_planes]
+        for k in np.argsort([start.least for start in starts], kind="stable"):
+            found[k] = self._run(on_planes[k], starts[k], *found[k])
+        return found
 
-    def run(self, on_plane: _OnPlane, start: _Start) -> tuple[Nodes, Array]:
-        """The poses of a plane that are within the window of the best so far, with their costs; the seed among them."""
+    def _seed(self, on_plane: _OnPlane) -> tuple[Nodes, Array]:
+        pose, cost = on_plane.seed()
+        if len(pose):
+            self._improve(cost)
+        return pose, np.full(len(pose), cost)
+
+    def _start(self, on_plane: _OnPlane) -> _Start:
+        """The top nodes that may matter; groups that are not reached in time are left out, by what their priors cost."""
+        found, used, at, stage = [], 0, on_plane.stage.first, on_plane.stage
+        step = max(8 * _CHUNK // (on_plane.area[2] * on_plane.area[3]), 1)
+        while at < stage.last and not self.patience.over():
+            nodes, bounds, compared, missed = on_plane.start(at, min(at + step, stage.last), self.best, self.window)
+            found.append((nodes, bounds))
+            used, at, self.missed_mass = used + compared, at + step, self.missed_mass + missed
+        if at < stage.last:
+            left = on_plane.tree.cost[at : stage.last] + on_plane.scene.constant
+            self.miss(np.asarray(on_plane.tree.leaves[at : stage.last] * float(on_plane.ny * on_plane.nx)), left)
+            self.reach = min(self.reach, float(left.min()))
+        return _Start(*_joined(found), used)
+
+    def _run(self, on_plane: _OnPlane, start: _Start, seed: Nodes, seed_cost: Array) -> tuple[Nodes, Array]:
         nodes, bounds, left = start.nodes, start.bounds, self.budget - start.used
-        if self.best > start.followed_to:
-            bounds = start.prior_costs.copy()
-            left -= self._bound(on_plane, nodes, bounds, self.best)
         for level in range(on_plane.top - 1, -1, -1):
-            nodes, bounds = self._sift(on_plane, nodes, bounds, level + 1)
-            if len(nodes) > _DIVE_AGAIN:
-                pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best)
-                if cost < start.seed_cost:
-                    start.seed, start.seed_cost = pose, cost
+            nodes, bounds = self._fit(on_plane, nodes, bounds, level + 1)
+            if len(nodes) > _DIVE_AGAIN or (self.assumed and len(nodes) > _BEAM):
+                pose, cost = on_plane.dive(nodes, bounds, level + 1, self.best, _WIDE)
+                if cost < self.best:
+                    seed, seed_cost = pose, np.array([cost])
                     self._improve(cost)
-            nodes, bounds, used = self._split(on_plane, nodes, bounds, level, left // (level + 1))
+            nodes, bounds, used = self._split(on_plane, nodes, bounds, level, max(left, 0) // (level + 1))
             left -= used
-        return self._poses(nodes, bounds, start)
+        self.used = max(self.used, self.budget - left)
+        if len(seed) and not (nodes == seed).all(axis=1).any():
+            nodes, bounds = np.concatenate([seed, nodes]), np.concatenate([seed_cost, bounds])
+        keep = self._keep(bounds, self.capacity)
+        self.miss(np.ones(len(bounds) - int(keep.sum())), bounds[~keep])
+        return nodes[keep], bounds[keep]
 
     def miss(self, poses: Array, bounds: Array) -> None:
         """Count nodes of so many poses that are left out, by their bounds."""
         near = bounds < self.best + 2.0 * _NEGLIGIBLE_NATS
         self.missed_mass += float(poses[near] @ np.exp(np.minimum(0.5 * (self.best - bounds[near]), 300.0)))
-
-    def _poses(self, nodes: Nodes, costs: Array, start: _Start) -> tuple[Nodes, Array]:
-        """What is left at the end, and the seed."""
-        seeded = (nodes == start.seed).all(axis=1) if len(start.seed) else np.zeros(len(nodes), dtype=np.bool_)
-        if len(start.seed) and not seeded.any():
-            nodes, costs = np.concatenate([start.seed, nodes]), np.append(start.seed_cost, costs)
-        if not len(nodes):
-            return nodes, costs
-        self._improve(float(costs.min()))
-        keep = self._keep(costs, self.capacity)
-        self.miss(np.ones(len(costs) - int(keep.sum())), costs[~keep])
-        return nodes[keep], costs[keep]
-
-    def _bound(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, best: float) -> int:
-        """Bound top nodes, those that are reached in time; returns the values compared."""
-        used = 0
-        for first in range(0, len(nodes), 8 * _CHUNK):
-            if self.patience.over():
-                break
-            part = slice(first, first + 8 * _CHUNK)
-            used += on_plane.bound(nodes[part], bounds[part], on_plane.top, best, self.window, _ENDLESS)[1]
-        return used
 
     def _split(
         self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int, allowed: int
@@ -322,32 +313,28 @@ class _Sweep:
         if on_plane.most(nodes) > allowed:
             order = np.argsort(bounds, kind="stable")
             nodes, bounds = nodes[order], bounds[order]
-        found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))]
+        found: list[tuple[Nodes, Array]] = []
         done = used = 0
         while done < len(nodes) and used < allowed and not self.patience.over():
-            part = slice(done, done + _CHUNK)
-            parts, costs, known = on_plane.split(nodes[part], bounds[part], level)
-            reached, compared = on_plane.bound(parts, costs, level, self.best, self.window, allowed - used)
-            if reached < len(parts):
-                self._leave(on_plane, parts[reached:], known[reached:], level)
-            *kept, missed = on_plane.sift(parts[:reached], costs[:reached], level, self.best, self.window)
-            found.append((kept[0], kept[1]))
-            done, used, self.missed_mass = done + _CHUNK, used + compared, self.missed_mass + missed
+            part = nodes[done : done + _CHUNK]
+            parts, costs, reached, compared, missed, least = on_plane.split(
+                part, level, self.best, self.window, allowed - used
+            )
+            found.append((parts, costs))
+            done, used, self.missed_mass = done + reached, used + compared, self.missed_mass + missed
+            if level == 0:
+                self._improve(least)
         if done < len(nodes):
             self._leave(on_plane, nodes[done:], bounds[done:], level + 1)
-        if len(found) == 2:
-            return *found[1], used
-        return np.concatenate([parts for parts, _ in found]), np.concatenate([costs for _, costs in found]), used
+        return *_joined(found), used
 
     def _leave(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> None:
         """Leave out nodes that were not reached: the window ends where they may begin."""
         self.miss(on_plane.poses(nodes, level), bounds)
-        self.window = min(self.window, max(float(bounds.min()) - self.best, 0.0))
+        self.reach = min(self.reach, float(bounds.min()))
 
-    def _sift(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
-        """Those within the window; it shrinks when they are more than there is room for."""
-        nodes, bounds, missed = on_plane.sift(nodes, bounds, level, self.best, self.window)
-        self.missed_mass += missed
+    def _fit(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
+        """No more than there is room for: the window shrinks."""
         if len(nodes) > _NODES_PER_POSE * self.capacity:
             keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
             self.miss(on_plane.poses(nodes[~keep], level), bounds[~keep])
@@ -357,17 +344,25 @@ class _Sweep:
     def _improve(self, cost: float) -> None:
         if cost < self.best:
             self.missed_mass *= float(np.exp(0.5 * (cost - self.best)))
-            self.best = cost
+            self.best, self.assumed = cost, False
 
     def _keep(self, bounds: Array, room: int) -> NDArray[np.bool_]:
         """Which to follow: those within the window, which shrinks when they are more than there is room for."""
         keep = bounds <= self.best + self.window
         if keep.sum() <= room:
             return keep
-        self.window = max(float(np.partition(bounds, room)[room]) - self.best, 0.0)
+        self.reach = min(self.reach, float(np.partition(bounds, room)[room]))
         chosen = np.flatnonzero(bounds <= self.best + self.window)
         if len(chosen) > room:  # as good as equal: some of them, evenly
             chosen = chosen[np.linspace(0, len(chosen) - 1, room).astype(np.int64)]
         keep[:] = False
         keep[chosen] = True
         return keep
+
+
+def _joined(parts: list[tuple[Nodes, Array]]) -> tuple[Nodes, Array]:
+    if len(parts) == 1:
+        return parts[0]
+    if not parts:
+        return np.empty((0, 3), np.int32), np.empty(0)
+    return np.concatenate([nodes for nodes, _ in parts]), np.concatenate([bounds for _, bounds in parts])
