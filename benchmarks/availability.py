@@ -162,13 +162,17 @@ def answer_all_ways(
 
 
 def ratio_at(matched: Matched, fix: Fix, distance_m: float | None) -> float:
-    """Of the best pose and the best one so far from it, in the same match; zero: the map ends before."""
+    """Of the best pose and the best one so far from it, in the same match; zero: the map ends before.
+
+    Never more than was searched for: where no rival was found, all that is known is that it is as much.
+    """
     assert distance_m is not None
-    if distance_m == matched.options.mlr_min_distance_m:
-        return fix.mlr.ratio or 0.0
-    options = replace(matched.options, mlr_min_distance_m=distance_m)
-    elsewhere = replace(matched, options=options)
-    return mlr_estimate(elsewhere, believe(elsewhere), options).ratio or 0.0
+    mlr = fix.mlr
+    if distance_m != matched.options.mlr_min_distance_m:
+        options = replace(matched.options, mlr_min_distance_m=distance_m)
+        elsewhere = replace(matched, options=options)
+        mlr = mlr_estimate(elsewhere, believe(elsewhere), options)
+    return min(mlr.ratio or 0.0, RATIOS[-1])
 
 
 def answer_windows(
