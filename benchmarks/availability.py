@@ -388,9 +388,9 @@ def report(parts: Sequence[Answered], every_parameter: bool) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--windows", type=int, default=100, help="level ones, and demeaned, of each length and building"
+        "--windows", type=int, default=60, help="level ones, and demeaned, of each length and building"
     )
-    parser.add_argument("--norm-windows", type=int, default=25, help="norms of each length and building: slower")
+    parser.add_argument("--norm-windows", type=int, default=12, help="norms of each length and building: slower")
     parser.add_argument("--buildings", type=int, default=2)
     parser.add_argument("--floors", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
