@@ -32,9 +32,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from app.geometry import Array
-from app.positioning.belief import believe
+from app.positioning import belief as believing
+from app.positioning.belief import Belief, believe
 from app.positioning.estimates import abl_estimate, mlr_estimate
-from app.positioning.fix import Fix, LocateOptions
+from app.positioning.fix import LocateOptions
 from app.positioning.floors import SearchableFloor, reduce_floor
 from app.positioning.locate import prepare_floors, warm_up
 from app.positioning.matching import Matched, match
@@ -147,8 +148,8 @@ def answer_all_ways(
         rows.sure[technique].append(sure)
         rows.error_m[technique].append(float(off) if floor_id == str(pose.floor) else np.inf)
 
-    for technique in MLR:
-        tell(technique, ratio_at(matched, fix, technique.parameter_m), ml.floor_id, ml.position_m)
+    for technique, ratio in ratios(matched, belief).items():
+        tell(technique, ratio, ml.floor_id, ml.position_m)
     for by_peak, by_mass in zip(ABL, ABL_MASS, strict=True):
         assert by_peak.parameter_m is not None
         abl = abl_estimate(matched, belief, replace(sweeping, abl_bin_m=by_peak.parameter_m))
@@ -161,18 +162,20 @@ def answer_all_ways(
     rows.is_fix.append(fix.status == "fix")
 
 
-def ratio_at(matched: Matched, fix: Fix, distance_m: float | None) -> float:
-    """Of the best pose and the best one so far from it, in the same match; zero: the map ends before.
+def ratios(matched: Matched, known: Belief) -> dict[Technique, float]:
+    """Of the best pose and the best one so far from it, for every distance; zero: the map ends before.
 
-    Never more than was searched for: where no rival was found, all that is known is that it is as much.
+    What `believe` does for the one distance it is asked for. Never more than was searched for: where no rival was
+    found, all that is known is that it is as much.
     """
-    assert distance_m is not None
-    mlr = fix.mlr
-    if distance_m != matched.options.mlr_min_distance_m:
-        options = replace(matched.options, mlr_min_distance_m=distance_m)
-        elsewhere = replace(matched, options=options)
-        mlr = mlr_estimate(elsewhere, believe(elsewhere), options)
-    return min(mlr.ratio or 0.0, RATIOS[-1])
+    optima = believing._optima(matched, believing.pose_gaussian(matched))
+    found = {}
+    for technique in MLR:
+        assert technique.parameter_m is not None
+        options = replace(matched.options, mlr_min_distance_m=technique.parameter_m)
+        belief = replace(known, log_ratio=believing._log_ratio(optima, technique.parameter_m))
+        found[technique] = min(mlr_estimate(matched, belief, options).ratio or 0.0, RATIOS[-1])
+    return found
 
 
 def answer_windows(
@@ -387,10 +390,8 @@ def report(parts: Sequence[Answered], every_parameter: bool) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--windows", type=int, default=60, help="level ones, and demeaned, of each length and building"
-    )
-    parser.add_argument("--norm-windows", type=int, default=12, help="norms of each length and building: slower")
+    parser.add_argument("--windows", type=int, default=60, help="level ones of each length and building")
+    parser.add_argument("--ambiguous", type=int, default=15, help="demeaned ones and norms, which take much longer")
     parser.add_argument("--buildings", type=int, default=2)
     parser.add_argument("--floors", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
@@ -403,8 +404,10 @@ def main() -> int:
         rng = np.random.default_rng([given.seed, number])
         building = make_building(rng, floors=given.floors)
         floors = prepare_floors({str(k): surveyed_map(building, k, rng) for k in range(given.floors)})
-        for kind, count in zip(KINDS, (given.windows, given.windows, given.norm_windows), strict=True):
+        for k, kind in enumerate(KINDS):
+            count = given.windows if kind == KINDS[0] else given.ambiguous
             for length_m in LENGTHS_M if count else ():
+                rng = np.random.default_rng([given.seed, number, k, round(10.0 * length_m)])
                 part = answer_windows(building, floors, count, kind, length_m, rng)
                 found.setdefault((kind, length_m), []).append(part)
     parts = [pooled(each) for each in found.values()]
