@@ -8,15 +8,17 @@ norms; heading unknown, every floor a candidate. Each is matched once, and then 
     ABL          the mean of the heaviest bin of 0.5, 1, 2 or 4 m, sure by the largest share of a cell over the uniform
     ABL, mass    the same place, sure by the share of that bin
     posterior    its position, sure by the probability of its strongest mode (off the map and missed mass counted in)
+    ... mapped   the same, taking for granted that the window was walked where there is a map
     radius       its position, sure by how small its 95 % radius is
 
 A threshold on the sureness withholds answers: availability is the share of windows answered, accuracy the share of the
 answered that end on the right floor within 1 m (3 m) of the truth (Shockley 8.9). Standard errors and those of
 differences come from resampling the windows.
 
-    python benchmarks/availability.py --windows 200 --picture docs/pictures/availability.png
-                      exits 1 unless ABL or the posterior is at least as accurate as MLR, within two standard errors,
-                      when 50, 80 and 95 % of the windows of each kind are answered
+Which of them is more accurate than MLR when 50, 80 and 95 % of the windows are answered is a finding, not a target.
+
+    python benchmarks/availability.py --picture docs/pictures/availability.png
+                      exits 1 unless of the windows that `locate` calls a fix 95 % are within 1 m, of every kind
 """
 
 import argparse
@@ -54,7 +56,7 @@ SHARES = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)
 RADII_M = (100.0, 30.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5)
 AVAILABILITIES = (0.5, 0.8, 0.95)
 NEAR_M, NEARISH_M = 1.0, 3.0
-RELIABLE = 0.95  # a default should let so many of its answers be within NEAR_M
+RELIABLE = 0.95  # so many answers should be within NEAR_M
 DRAWS = 300
 DEFAULTS = LocateOptions()
 
@@ -93,11 +95,12 @@ MLR = tuple(Technique("MLR", RATIOS, "ratio", d) for d in DISTANCES_M)
 ABL = tuple(Technique("ABL", MULTIPLES, "x uniform", b) for b in BINS_M)
 ABL_MASS = tuple(Technique("ABL, mass", SHARES, "of the mass", b) for b in BINS_M)
 POSTERIOR = Technique("posterior", SHARES, "probability")
+MAPPED = Technique("... mapped", SHARES, "probability")
 RADIUS = Technique("radius", RADII_M, "m", smaller_is_surer=True)
-TECHNIQUES = (*MLR, *ABL, *ABL_MASS, POSTERIOR, RADIUS)
+TECHNIQUES = (*MLR, *ABL, *ABL_MASS, POSTERIOR, MAPPED, RADIUS)
 DEFAULT_MLR = next(t for t in MLR if t.parameter_m == DEFAULTS.mlr_min_distance_m)
 DEFAULT_ABL = next(t for t in ABL if t.parameter_m == DEFAULTS.abl_bin_m)
-COMPARED = (DEFAULT_MLR, DEFAULT_ABL, POSTERIOR, RADIUS)
+COMPARED = (DEFAULT_MLR, DEFAULT_ABL, POSTERIOR, MAPPED, RADIUS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +161,7 @@ def answer_all_ways(
     unweighed = 0.0 if matched.candidates.complete else posterior.missed_probability
     strongest = posterior.modes[0].probability * (1.0 - posterior.off_map_probability) * (1.0 - unweighed)
     tell(POSTERIOR, strongest, posterior.floor_id, posterior.position_m)
+    tell(MAPPED, posterior.modes[0].probability, posterior.floor_id, posterior.position_m)
     tell(RADIUS, posterior.radius_95_m, posterior.floor_id, posterior.position_m)
     rows.is_fix.append(fix.status == "fix")
 
@@ -286,17 +290,17 @@ def report_equal(answered: Answered, techniques: Sequence[Technique]) -> None:
 
 def report_against_mlr(answered: Answered) -> bool:
     """Print who is more accurate than MLR at equal availability; whether ABL or the posterior never is less so."""
-    passed = True
+    never_less = True
     for availability in AVAILABILITIES:
         cells, words = [], []
-        for technique in (DEFAULT_ABL, POSTERIOR, RADIUS):
+        for technique in COMPARED[1:]:
             value, error = difference(answered, technique, DEFAULT_MLR, availability)
             margin = 2.0 * error + 1e-9
             words.append("better" if value > margin else "worse" if value < -margin else "no different")
             cells.append(f"{technique} {100 * value:+.1f} ± {100 * error:.1f} ({words[-1]})")
-        passed &= "worse" not in words[:2] or words[0] != words[1]
+        never_less &= words[:2] != ["worse", "worse"]
         print(f"{answered!s:13s} {100 * availability:3.0f} % answered: " + ", ".join(cells))
-    return passed
+    return never_less
 
 
 def report_least(answered: Answered, technique: Technique) -> None:
@@ -318,8 +322,8 @@ def report_least(answered: Answered, technique: Technique) -> None:
         )
 
 
-def report_shipped(answered: Answered) -> None:
-    """What the defaults of `locate` do: MLR and ABL as they answer, and the status "fix"."""
+def report_shipped(answered: Answered) -> bool:
+    """What the defaults of `locate` do: MLR and ABL as they answer, and the status "fix"; whether that is reliable."""
     rules = {
         f"MLR > {DEFAULTS.mlr_ratio:g}": (answered.sure[DEFAULT_MLR] > DEFAULTS.mlr_ratio, DEFAULT_MLR),
         f"ABL >= {ABL_UNIFORM_MULTIPLE:g}": (answered.sure[DEFAULT_ABL] >= ABL_UNIFORM_MULTIPLE, DEFAULT_ABL),
@@ -327,6 +331,8 @@ def report_shipped(answered: Answered) -> None:
     }
     for name, (given, technique) in rules.items():
         print(f"{answered!s:13s} {name:15s}  {told(share(given), share(answered.error_m[technique][given] <= NEAR_M))}")
+    fixed_m = answered.error_m[POSTERIOR][answered.is_fix]
+    return not len(fixed_m) or float(np.mean(fixed_m <= NEAR_M)) >= RELIABLE
 
 
 # ---- picture
@@ -337,7 +343,8 @@ def draw(parts: Sequence[Answered], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    colours, lines = ("#D55E00", "#0072B2", "#000000", "#009E73"), ("-", "--", "-.", ":")
+    colours = ("#D55E00", "#0072B2", "#000000", "#CC79A7", "#009E73")
+    lines = ("-", "--", "-.", "-", ":")
     kinds = [kind for kind in KINDS if any(part.kind == kind for part in parts)]
     figure = Figure(figsize=(10.0, 2.6 * len(kinds) + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
@@ -360,7 +367,7 @@ def draw(parts: Sequence[Answered], path: Path) -> None:
 
 
 def report(parts: Sequence[Answered], every_parameter: bool) -> int:
-    """Print all tables; 1 if MLR is more accurate than ABL and the posterior."""
+    """Print all tables; 1 if fixes are not reliable."""
     kinds = [kind for kind in KINDS if any(part.kind == kind for part in parts)]
     whole = [pooled([part for part in parts if part.kind == kind]) for kind in kinds]
     for answered in (*parts, *whole):
@@ -376,15 +383,17 @@ def report(parts: Sequence[Answered], every_parameter: bool) -> int:
     for answered in (*parts, *whole):
         for technique in TECHNIQUES if answered.length_m is None or every_parameter else COMPARED:
             report_least(answered, technique)
-    print(f"\nas shipped: available, within {NEAR_M:g} m")
-    for answered in (*parts, *whole):
-        report_shipped(answered)
     print(f"\nmore accurate than {DEFAULT_MLR}, points of the share within {NEAR_M:g} m")
     for answered in parts:
         report_against_mlr(answered)
-    verdicts = [report_against_mlr(answered) for answered in whole]
-    passed = all(verdicts)
-    print(f"ABL or the posterior at least as accurate as MLR at equal availability  {'PASS' if passed else 'FAIL'}")
+    never_less = [report_against_mlr(answered) for answered in whole]
+    print(f"ABL or the posterior always at least as accurate as MLR: {'yes' if all(never_less) else 'no'} (a finding)")
+    print(f"\nas shipped: available, within {NEAR_M:g} m")
+    for answered in parts:
+        report_shipped(answered)
+    reliable = [report_shipped(answered) for answered in whole]
+    passed = all(reliable)
+    print(f"a fix is within {NEAR_M:g} m in {100 * RELIABLE:.0f} % of every kind  {'PASS' if passed else 'FAIL'}")
     return 0 if passed else 1
 
 
