@@ -371,7 +371,7 @@ def report(parts: Sequence[Answered], every_parameter: bool) -> int:
     kinds = [kind for kind in KINDS if any(part.kind == kind for part in parts)]
     whole = [pooled([part for part in parts if part.kind == kind]) for kind in kinds]
     for answered in (*parts, *whole):
-        for technique in TECHNIQUES if every_parameter else COMPARED:
+        for technique in TECHNIQUES if answered.length_m is None or every_parameter else COMPARED:
             report_curve(answered, technique)
     print(f"\nwithin {NEAR_M:g} m when answered are     50 %             80 %             95 %")
     for answered in (*parts, *whole):
