@@ -79,3 +79,10 @@ def test_a_few_windows_are_answered_in_every_way(availability, small_building, k
     assert availability.report([part], every_parameter=True) in (0, 1)
     availability.draw([part], tmp_path / "curves.png")
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("wrong", "reliable"), [(0, True), (5, True), (6, False)])
+def test_of_a_hundred_fixes_five_may_be_wrong(availability, wrong, reliable):
+    near = np.arange(100) >= wrong
+    answered = made_up(availability, [np.ones(100)], [near])
+    assert availability.report_shipped(answered) == reliable
