@@ -1,13 +1,14 @@
 """Exact search against exhaustive scans, on one thread of this process, in processor time.
 
-100 x 100 m at 0.25 m, 20 samples over 10 m, 3 components, field sd 5 uT. Two cases: 72 headings with displacements and a
-sensor believed as they are (11.5 million poses); and a lattice of headings, step scales and heading drifts with an offset
-of the sensor integrated out (hundreds of millions of poses), for errors that are independent and for errors alike along
-the walk. For every random window the search must return the best pose and exactly the set of poses within `--nats` of it
-that scanning every pose returns. The scans are compiled, in single precision with inverse variances and
-log-determinants computed beforehand, fused over samples with vector instructions along the rows; what lies within their
-rounding of the limit is settled in double precision, outside the time taken. The plain case has a whole-array numpy scan
-beside it, timed on the first windows. Then the cost of a search is printed for 1, 2, 5 and 10 floors, one of them walked.
+100 x 100 m at 0.25 m, 20 samples over 10 m, 3 components, field sd 5 uT. Two cases: 72 headings with displacements
+and a sensor believed as they are (11.5 million poses); and a lattice of headings, step scales and heading drifts with
+an offset of the sensor integrated out (hundreds of millions of poses), for errors that are independent and for errors
+alike along the walk. For every random window the search must return the best pose and exactly the set of poses within
+`--nats` of it that scanning every pose returns. The scans are compiled, in single precision with inverse variances
+and log-determinants computed beforehand, fused over samples with vector instructions along the rows; what lies within
+their rounding of the limit is settled in double precision, outside the time taken. The plain case has a whole-array
+numpy scan beside it, timed on the first windows. Then the cost of a search is printed for 1, 2, 5 and 10 floors, one
+of them walked.
 
     python benchmarks/search.py --windows 500        exits non-zero if a set differs or a target is missed
 """
