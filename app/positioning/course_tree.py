@@ -128,9 +128,9 @@ def course_tree(
         stages.append(stage)
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
-    part: Index = np.concatenate(parts).astype(np.int32) if parts else np.empty(0, dtype=np.int32)
+    gathered: Index = np.concatenate(parts).astype(np.int32) if parts else np.empty(0, dtype=np.int32)
     return CourseTree(
-        Tree(place, feature, exact, middle, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, part),
+        Tree(place, feature, exact, middle, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, gathered),
         tuple(stages),
     )
 
