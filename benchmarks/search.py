@@ -1,13 +1,14 @@
 """Exact search against exhaustive scans, on one thread of this process, in processor time.
 
-100 x 100 m at 0.25 m, 20 samples over 10 m, 3 components, field sd 5 uT. Two cases: 72 headings with displacements and a
-sensor believed as they are (11.5 million poses); and a lattice of headings, step scales and heading drifts with an offset
-of the sensor integrated out (hundreds of millions of poses), for errors that are independent and for errors alike along
-the walk. For every random window the search must return the best pose and exactly the set of poses within `--nats` of it
-that scanning every pose returns. The scans are compiled, in single precision with inverse variances and
-log-determinants computed beforehand, fused over samples with vector instructions along the rows; what lies within their
-rounding of the limit is settled in double precision, outside the time taken. The plain case has a whole-array numpy scan
-beside it, timed on the first windows. Then the cost of a search is printed for 1, 2, 5 and 10 floors, one of them walked.
+100 x 100 m at 0.25 m, 20 samples over 10 m, 3 components, field sd 5 uT. Two cases: 72 headings with displacements
+and a sensor believed as they are (11.5 million poses); and a lattice of headings, step scales and heading drifts with
+an offset of the sensor integrated out (hundreds of millions of poses), for errors that are independent and for errors
+alike along the walk. For every random window the search must return the best pose and exactly the set of poses within
+`--nats` of it that scanning every pose returns. The scans are compiled, in single precision with inverse variances
+and log-determinants computed beforehand, fused over samples with vector instructions along the rows; what lies within
+their rounding of the limit is settled in double precision, outside the time taken. The plain case has a whole-array
+numpy scan beside it, timed on the first windows. Then the cost of a search is printed for 1, 2, 5 and 10 floors, one
+of them walked.
 
     python benchmarks/search.py --windows 500        exits non-zero if a set differs or a target is missed
 """
@@ -148,6 +149,7 @@ class OffsetScan(ExhaustiveScan):
 
     precision: float = OFFSET_SD_UT**-2
     yaw_rad: np.ndarray
+    course_cost: np.ndarray  # -2 log prior of the courses
 
     def near(self, turned: Turned, window_nats: float) -> tuple[np.ndarray, np.ndarray]:
         ny, nx = self.plane.shape
@@ -155,6 +157,7 @@ class OffsetScan(ExhaustiveScan):
             *self.single, turned.features_uT.astype(np.float32), turned.offset_cells, self.margin, ny, nx,
             np.float32(2.0 * window_nats + 2.0 * ROUNDING), np.float32(self.precision),
             np.cos(self.yaw_rad).astype(np.float32), np.sin(self.yaw_rad).astype(np.float32),
+            self.course_cost.astype(np.float32),
         )  # fmt: skip
 
     def cost(self, turned: Turned, poses: np.ndarray) -> np.ndarray:
@@ -162,7 +165,7 @@ class OffsetScan(ExhaustiveScan):
         w, c, s = self.weight[at], np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         shared = np.stack([(w * a).sum(axis=1) for a in (c * r[0] + s * r[1], c * r[1] - s * r[0], r[2])])
         total = w.sum(axis=1) + self.precision
-        plain = (np.sum(r**2, axis=0) * w + self.log_det[at]).sum(axis=1)
+        plain = (np.sum(r**2, axis=0) * w + self.log_det[at]).sum(axis=1) + self.course_cost[poses[:, 0]]
         return np.asarray(plain - np.sum(shared**2, axis=0) / total + 3.0 * np.log(total))
 
 
@@ -189,7 +192,7 @@ def _scan(mean, weight, log_det, z, offset, margin, ny, nx, window):  # type: ig
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _offset_scan(  # type: ignore[no-untyped-def]
-    mean, weight, log_det, z, offset, margin, ny, nx, window, precision, cosine, sine
+    mean, weight, log_det, z, offset, margin, ny, nx, window, precision, cosine, sine, course_cost
 ):
     least = np.float32(np.inf)
     poses, costs = [(0, 0, 0)], [least]
@@ -197,7 +200,7 @@ def _offset_scan(  # type: ignore[no-untyped-def]
     gx, gy, gz = np.empty(nx, dtype=np.float32), np.empty(nx, dtype=np.float32), np.empty(nx, dtype=np.float32)
     for h in range(z.shape[0]):
         for j in range(ny):
-            cost[:], gx[:], gy[:], gz[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            cost[:], gx[:], gy[:], gz[:] = course_cost[h], np.float32(0.0), np.float32(0.0), np.float32(0.0)
             total[:] = precision
             for k in range(z.shape[1]):
                 row, column = j + margin + offset[h, k, 0], margin + offset[h, k, 1]
@@ -308,7 +311,7 @@ def offset_case(
             continue
         turned = turn_window(window, courses, RESOLUTION_M)
         scan = OffsetScan(plane, NOISE_UT**2, inflation, margin=int(np.abs(turned.offset_cells).max()) + 2)
-        scan.yaw_rad = window.yaw_rad
+        scan.yaw_rad, scan.course_cost = window.yaw_rad, -2.0 * courses.log_prior
         start = process_time()
         near, _ = scan.near(turned, given.nats)
         compiled.append(process_time() - start)

@@ -1,10 +1,11 @@
 """Sliding-window bounds of a gridded field: the smallest and largest value in any square of 2^l cells.
 
 A level answers for the square of side s whose first cell is (j, i), wherever that lies: one lookup whatever the
-displacement of a block of poses. Sides are the powers of two and steps of a quarter between them, for poses that are not
-displaced alike. Starts are kept every q = max(1, s / 4) cells, for squares that much larger, so that high levels stay small enough for the processor's caches. Cells off the grid hold the prior. Variances are kept as
-one-byte codes of a logarithmic ladder, rounded outwards, beside the bounds of the mean in the same record. All levels
-lie in one array, so that a search may take each of its lookups from another level; a last record covers everything.
+displacement of a block of poses. Sides are the powers of two and steps of a quarter between them, for poses that are
+not displaced alike. Starts are kept every q = max(1, s / 4) cells, for squares that much larger, so that high levels
+stay small enough for the processor's caches. Cells off the grid hold the prior. Variances are kept as one-byte codes
+of a logarithmic ladder, rounded outwards, beside the bounds of the mean in the same record. All levels lie in one
+array, so that a search may take each of its lookups from another level; a last record covers everything.
 """
 
 from dataclasses import dataclass

@@ -104,18 +104,18 @@ def course_tree(
     exact = np.ascontiguousarray(turned.features_uT[:, order])
     middle, cost = np.empty((groups, 4), dtype=np.int32), np.empty(groups)
     leaves, first = np.ones(groups, dtype=np.int32), np.zeros(groups + 1, dtype=np.int32)
-    level, typical = np.zeros((groups, n), dtype=np.int32), np.arange(groups, dtype=np.int32)
+    level, typical = np.zeros((groups, n), dtype=np.int32), np.arange(groups).astype(np.int32)
     _leaves(offset, exact, order, middle_sample, extent, feature, middle)
     cost[: len(courses)] = -2.0 * courses.log_prior
     heading = np.empty((groups, 2))
     heading[: len(courses), 0], heading[: len(courses), 1] = np.cos(courses.heading_rad), np.sin(courses.heading_rad)
     parts, stages, below = [], [], Stage(0, 0, len(courses))
-    for l, (size, single) in enumerate(zip(sizes, alone, strict=True)):
-        stage = Stage(l, 0, len(courses))
+    for level_of, (size, single) in enumerate(zip(sizes, alone, strict=True)):
+        stage = Stage(level_of, 0, len(courses))
         if not single:
             start = below.last
-            stage = Stage(l, start, start + size)
-            part, counted = _nest(counts, shifts[l - 1], shifts[l])
+            stage = Stage(level_of, start, start + size)
+            part, counted = _nest(counts, shifts[level_of - 1], shifts[level_of])
             first[start + 1 : start + size + 1] = first[start] + np.cumsum(counted)
             parts.append((part + below.first).astype(np.int32))
             _join(
@@ -124,13 +124,13 @@ def course_tree(
             heading[start : start + size] = heading[parts[-1][first[start : start + size] - first[start]]]
             held = first[start : start + size] - first[start]
             typical[start : start + size] = typical[parts[-1][held + counted // 2]]
-            _choose_squares(extent[start : start + size], l, places, level[start : start + size])
+            _choose_squares(extent[start : start + size], level_of, places, level[start : start + size])
         stages.append(stage)
         below = stage
     place = np.ascontiguousarray(np.stack([extent[..., 0], extent[..., 2], level], axis=-1))
-    part = np.concatenate(parts) if parts else np.empty(0, dtype=np.int32)
+    gathered: Index = np.concatenate(parts).astype(np.int32) if parts else np.empty(0, dtype=np.int32)
     return CourseTree(
-        Tree(place, feature, exact, middle, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, part),
+        Tree(place, feature, exact, middle, heading, cost, typical, leaves, 2.0 * np.log(leaves), first, gathered),
         tuple(stages),
     )
 
@@ -258,8 +258,8 @@ def _choose_squares(extent, block_level, places, chosen):  # type: ignore[no-unt
         for k in range(extent.shape[1]):
             rows, columns = side + extent[g, k, 1] - extent[g, k, 0], side + extent[g, k, 3] - extent[g, k, 2]
             chosen[g, k] = last
-            for l in range(last):
-                base, shift, covered = places[l, 0], places[l, 1], places[l, 5]
+            for square in range(last):
+                base, shift, covered = places[square, 0], places[square, 1], places[square, 5]
                 down = right = 0
                 if shift <= block_level:
                     covered += (1 << shift) - 1
@@ -268,5 +268,5 @@ def _choose_squares(extent, block_level, places, chosen):  # type: ignore[no-unt
                         (extent[g, k, 2] + base) & ((1 << shift) - 1),
                     )
                 if down + rows <= covered and right + columns <= covered:
-                    chosen[g, k] = l
+                    chosen[g, k] = square
                     break

@@ -75,11 +75,11 @@ def _batch(nodes, costs, count, level, tree, scene, best, window, kept, bounds, 
 
 @numba.njit(cache=True, nogil=True)
 def top(first, last, level, area, tree, scene, best, window):  # type: ignore[no-untyped-def]
-    """The nodes of groups `first` to `last` (excluded) over an area (first row, first column, blocks down, blocks right)
-    that are within their limits.
+    """The nodes of groups `first` to `last` (excluded) over an area (first row, first column, blocks down, blocks
+    right) that are within their limits.
 
-    Returns them, their bounds, the samples compared, and the mass relative to a pose of cost `best` that the others hold
-    at most.
+    Returns them, their bounds, the samples compared, and the mass relative to a pose of cost `best` that the others
+    hold at most.
     """
     middle, walkable, prior, cost = tree.middle, scene.walkable, scene.prior, tree.cost
     ny, nx, side = scene.mean.shape[0] - 2, scene.mean.shape[1] - 2, 1 << level
@@ -112,8 +112,8 @@ def top(first, last, level, area, tree, scene, best, window):  # type: ignore[no
 def split(nodes, level, tree, scene, best, window, allowed):  # type: ignore[no-untyped-def]
     """The parts, with blocks of 2^level cells, of nodes of the stage above, that are within their limits.
 
-    Returns them, their bounds, how many nodes were split before `allowed` samples were compared, how many were compared,
-    the mass relative to a pose of cost `best` that other parts hold at most, and the least cost of a part.
+    Returns them, their bounds, how many nodes were split before `allowed` samples were compared, how many were
+    compared, the mass relative to a pose of cost `best` that other parts hold at most, and the least cost of a part.
     """
     middle, walkable, prior, cost = tree.middle, scene.walkable, scene.prior, tree.cost
     first, part = tree.first, tree.part

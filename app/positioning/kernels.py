@@ -92,13 +92,13 @@ def limit_of(size, spare, best, window):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def record_of(j, i, l, places):  # type: ignore[no-untyped-def]
-    """Index of the record that covers the square at (j, i) of those with index l."""
-    base, shift = places[l, 0], places[l, 1]
-    height, width = places[l, 2], places[l, 3]
+def record_of(j, i, square, places):  # type: ignore[no-untyped-def]
+    """Index of the record that covers the square at (j, i) of those with index square."""
+    base, shift = places[square, 0], places[square, 1]
+    height, width = places[square, 2], places[square, 3]
     a = min(max((j + base) >> shift, 0), height - 1)
     b = min(max((i + base) >> shift, 0), width - 1)
-    return places[l, 4] + a * width + b
+    return places[square, 4] + a * width + b
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -132,7 +132,8 @@ def plain_bounds(nodes, costs, level, tree, scene, best, window):  # type: ignor
         for q in range(count):
             p = followed[q]
             g = nodes[p, 0]
-            at = record_of(nodes[p, 1] + place[g, k, 0], nodes[p, 2] + place[g, k, 1], max(place[g, k, 2], square), places)
+            j, i = nodes[p, 1] + place[g, k, 0], nodes[p, 2] + place[g, k, 1]
+            at = record_of(j, i, max(place[g, k, 2], square), places)
             if c == 3:
                 x = max(max(feature[g, k, 0] - records[at, 3], records[at, 0] - feature[g, k, 3]), NOTHING)
                 y = max(max(feature[g, k, 1] - records[at, 4], records[at, 1] - feature[g, k, 4]), NOTHING)

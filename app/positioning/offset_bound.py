@@ -1,13 +1,13 @@
 """Bound of a node with a constant offset of the sensor integrated out.
 
 Over the node the residual of sample i lies in a box, and an offset b shifts all boxes alike (turned to the building's
-axes by R_i): the least cost is min_b g(b), g(b) = sum_i w_i |e_i(b)|^2 + p |b|^2, with e_i(b) the distance vector of the
-box, shifted by R_i b, from zero. g is convex, and any vectors l_i bound it from below by duality,
+axes by R_i): the least cost is min_b g(b), g(b) = sum_i w_i |e_i(b)|^2 + p |b|^2, with e_i(b) the distance vector of
+the box, shifted by R_i b, from zero. g is convex, and any vectors l_i bound it from below by duality,
     g(b) >= 2 (sum_i l_i mid_i - |l_i| half_i) - sum_i |l_i|^2 / w_i - |sum_i R_i' l_i|^2 / p.
-With l_i = t w_i e_i(b) and the best t this is L^2 / Q, L = sum w_i |e_i|^2 + s b, Q = sum w_i |e_i|^2 + |s|^2 / p,
-s = sum w_i R_i' e_i: exact at the best b, which a few Newton steps from zero come close to. Without a prior (p = 0) the
-sum of the l_i must vanish: what it is gets subtracted from them. Any part of the samples gives a bound too, so that most
-nodes are given up after a few.
+With l_i = t w_i e_i(b) and the best t this is L^2 / Q, L = sum w_i |e_i|^2 + s b, Q = sum w_i |e_i|^2 + |s|^2 / p, s
+= sum w_i R_i' e_i: exact at the best b, which a few Newton steps from zero come close to. Without a prior (p = 0) the
+sum of the l_i must vanish: what it is gets subtracted from them. Any part of the samples gives a bound too, so that
+most nodes are given up after a few.
 """
 
 import math
@@ -171,7 +171,9 @@ def offset_bounds(nodes, costs, level, tree, scene, best, window):  # type: igno
     for p in range(len(nodes)):
         known, stop = costs[p], limit_of(tree.size[nodes[p, 0]], spare, best, window)
         bound, used = _offset_bound(
-            nodes[p, 0], nodes[p, 1], nodes[p, 2], square, place, feature, heading, kind, ladder, records, codes, places, turn,
+            nodes[p, 0], nodes[p, 1], nodes[p, 2], square, place, feature, heading, kind, ladder, records,
+            codes, places,
+            turn,
             scene.headed, scene.offset, known, stop, box, weight,
         )  # fmt: skip
         costs[p] = bound - SLACK * (1.0 + bound - known) - ROUNDING * abs(bound)

@@ -1,11 +1,11 @@
 """Exact global search: branch and bound over the poses of all candidate floors, with one shared incumbent.
 
-Returns the pose an exhaustive scan would return, and every pose within a window of it. The tree is joint: a node holds
-the poses of a group of courses whose middle sample is in a block of cells (see `course_tree` for the groups, `kernels`
-and `offset_bound` for the bounds); both are halved from level to level. A beam of promising nodes finds a good incumbent
-first; then every level is bounded, pruned and split. What was pruned is bounded too: `missed_mass` says how much
-posterior it could hold at most. The work is limited by a budget, counted and not timed, and by the caller's patience:
-where either ends first, fewer nodes are followed, the others but bounded.
+Returns the pose an exhaustive scan would return, and every pose within a window of it. The tree is joint: a node
+holds the poses of a group of courses whose middle sample is in a block of cells (see `course_tree` for the groups,
+`kernels` and `offset_bound` for the bounds); both are halved from level to level. A beam of promising nodes finds a
+good incumbent first; then every level is bounded, pruned and split. What was pruned is bounded too: `missed_mass`
+says how much posterior it could hold at most. The work is limited by a budget, counted and not timed, and by the
+caller's patience: where either ends first, fewer nodes are followed, the others but bounded.
 """
 
 from collections.abc import Callable, Sequence
@@ -91,8 +91,8 @@ class _OnPlane:
     def split(
         self, nodes: Nodes, level: int, best: float, window: float, allowed: int
     ) -> tuple[Nodes, Array, int, int, float, float]:
-        """The parts of nodes that may matter, their bounds, how many nodes were split with as many comparisons as allowed,
-        the values compared, the mass other parts hold, and the least cost of a part."""
+        """The parts of nodes that may matter, their bounds, how many nodes were split with as many comparisons as
+        allowed, the values compared, the mass other parts hold, and the least cost of a part."""
         parts, bounds, done, used, missed, least = split(
             nodes, level, self.tree, self.scene, best, window, allowed // self.compared
         )
@@ -104,7 +104,8 @@ class _OnPlane:
         return self.dive(nodes, costs, self.top, np.inf, wide=len(nodes))
 
     def dive(self, nodes: Nodes, bounds: Array, level: int, best: float, wide: int) -> tuple[Nodes, float]:
-        """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds one."""
+        """A good pose (1, 3) below some nodes, and its cost, exact if below `best`; none (0, 3) if none of them holds
+        one."""
         beam = _BEAM
         while True:
             pose, cost = dive(nodes, bounds, level, max(wide, beam), beam, self.tree, self.scene, best)
@@ -180,7 +181,7 @@ def _on_planes(
     along = np.abs(window.path_m - 0.5 * (window.path_m[0] + window.path_m[-1]))
     trees: dict[float, CourseTree] = {}
     on_planes, expected = [], -np.inf
-    for plane, walkable in zip(planes, prior.walkable or [None] * len(planes), strict=True):
+    for plane, walkable in zip(planes, prior.walkable or (None,) * len(planes), strict=True):
         scene, usual = make_scene(plane, window, order, prior, error, walkable)
         if plane.resolution_m not in trees:
             steep = max(p.gradient_uT_per_m for p in planes) * plane.resolution_m
@@ -251,7 +252,8 @@ class _Sweep:
         return max(min(self.asked, self.reach - self.best), 0.0)
 
     def over(self, on_planes: Sequence[_OnPlane]) -> list[tuple[Nodes, Array]]:
-        """Per plane the poses within the window of the best so far, with their costs; the most promising plane first."""
+        """Per plane the poses within the window of the best so far, with their costs; the most promising plane
+        first."""
         found: list[tuple[Nodes, Array]] = [(np.empty((0, 3), np.int32), np.empty(0))] * len(on_planes)
         if not self.assumed:
             found = [self._seed(on_plane) for on_plane in on_planes]
@@ -267,7 +269,8 @@ class _Sweep:
         return pose, np.full(len(pose), cost)
 
     def _start(self, on_plane: _OnPlane) -> _Start:
-        """The top nodes that may matter; groups that are not reached in time are left out, by what their priors cost."""
+        """The top nodes that may matter; groups that are not reached in time are left out, by what their
+        priors cost."""
         found, used, at, stage = [], 0, on_plane.stage.first, on_plane.stage
         step = max(8 * _CHUNK // (on_plane.area[2] * on_plane.area[3]), 1)
         while at < stage.last and not self.patience.over():
@@ -306,10 +309,8 @@ class _Sweep:
     def _split(
         self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int, allowed: int
     ) -> tuple[Nodes, Array, int]:
-        """The parts of nodes that are worth following, their bounds, and the values compared, hardly more than allowed.
-
-        What is not reached, by the budget or in time, is left out, the least promising first.
-        """
+        """The parts of nodes that are worth following, their bounds, and the values compared, hardly more than
+        allowed. What is not reached, by the budget or in time, is left out, the least promising first."""
         if on_plane.most(nodes) > allowed:
             order = np.argsort(bounds, kind="stable")
             nodes, bounds = nodes[order], bounds[order]

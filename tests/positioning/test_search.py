@@ -53,8 +53,9 @@ def exhaustive_scores(
                 if len(plane.scale) == 3
                 else window.features_uT[k] - mean
             )
-            if len(plane.scale) == 3:
-                r = (r @ yaw_matrix((courses.heading_rad[h] if window.turns else 0.0) + window.yaw_rad[k])) @ (window.tilt[k].T if len(window.tilt) else np.eye(3))
+            if len(plane.scale) == 3:  # to the sensor's axes, which the drift does not turn
+                facing = (courses.heading_rad[h] if window.turns else 0.0) + window.yaw_rad[k]
+                r = (r @ yaw_matrix(facing)) @ (window.tilt[k].T if len(window.tilt) else np.eye(3))
             residuals.append(r)
             variances.append(error.inflation * (error.own_share * variance + window.noise_variance_uT2[k]))
         r, v = np.array(residuals), np.array(variances)[..., None]
@@ -130,7 +131,7 @@ def test_finds_exactly_what_the_exhaustive_scan_finds(
     components = "norm" if frame == "norm" else "vector"
     planes = [p for k, g in enumerate(grids) for p in reduce_floor(prepare_floor(str(k), g), components).planes]
     asked = walked.window
-    if tilted and frame == "building":
+    if tilted and frame != "norm":
         asked = dataclasses.replace(asked, device_to_frame=Rotation.random(samples, random_state=rng).as_matrix())
     window = reduce_window(asked, components, 0.25, planes[0].scale)
     if len(window) == 1 and offset_precision == 0.0:
@@ -151,6 +152,57 @@ def courses_of(window: Window, step_rad: float, *, nuisances: bool = False) -> C
     h, s, d = (a.ravel() for a in np.meshgrid(headings, [-0.1, 0.0, 0.1], [-0.05, 0.0, 0.05], indexing="ij"))
     drift = d if window.frame != "building" else 0.0 * d
     return Courses(h, 1.0 + s, drift, np.log(1.0 + s + 0.1 * d), Steps(step_rad, 0.1, 0.05))
+
+
+@pytest.mark.parametrize("precision", [None, 0.0, 1.0])
+@pytest.mark.parametrize("counts", [(37, 5, 3), (1, 7, 2), (16, 1, 9), (5, 1, 1)])
+def test_groups_of_a_fine_lattice_lose_nothing(
+    counts: tuple[int, int, int], precision: float | None, grid_of: Callable, walk_on: Callable
+) -> None:
+    """Headings, scales and drifts so close that groups of them go with every size of block; odd counts among them."""
+    rng = np.random.default_rng(21)
+    planes = prepare_floor("a", grid_of(rng, (24, 31), length_m=3.0)).planes
+    walked = walk_on(rng, grid_of(rng, (60, 60)), length_m=6.0)
+    window = reduce_window(walked.window, "vector", 0.25)
+    h, s, d = (
+        a.ravel()
+        for a in np.meshgrid(
+            walked.yaw_rad + 0.05 * np.arange(counts[0]), 1.0 + 0.02 * np.arange(counts[1]),
+            0.01 * np.arange(counts[2]), indexing="ij",
+        )
+    )  # fmt: skip
+    courses = Courses(h, s, d, rng.normal(size=len(h)), Steps(0.05, 0.02, 0.01))
+    error = dataclasses.replace(plain_error(len(window), precision), inflation=2.0)
+    assert_same_as_exhaustive(planes, window, courses, PosePrior(), error, 10.0)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (2, 3)])
+@pytest.mark.parametrize("precision", [None, 0.4])
+def test_windows_longer_than_the_map_and_courses_in_no_order(
+    shape: tuple[int, int], precision: float | None, grid_of: Callable, walk_on: Callable
+) -> None:
+    rng = np.random.default_rng(22)
+    grid: FieldGrid = grid_of(rng, (2, 30))
+    kept = np.s_[:, : shape[0], : shape[1]]
+    names = ("mean_uT", "sd_uT", "gradient_uT_per_m", "measured")
+    grid = dataclasses.replace(grid, **{name: getattr(grid, name)[kept] for name in names})
+    planes = prepare_floor("a", grid).planes
+    walked = walk_on(rng, grid_of(rng, (60, 60)), length_m=10.0)
+    window = reduce_window(walked.window, "vector", 0.25)
+    courses = single_course(rng.uniform(-np.pi, np.pi, 23))
+    assert_same_as_exhaustive(planes, window, courses, PosePrior(), plain_error(len(window), precision), 12.0)
+
+
+def test_a_window_that_matches_nothing_finds_the_best_all_the_same(grid_of: Callable, walk_on: Callable) -> None:
+    rng = np.random.default_rng(23)
+    planes = [plane for k in range(2) for plane in prepare_floor(str(k), grid_of(rng, (30, 40))).planes]
+    walked = walk_on(rng, grid_of(rng, (60, 60)), length_m=6.0)
+    window, courses = reduce_window(walked.window, "vector", 0.25), courses_of(walked.window, 0.2)
+    window = dataclasses.replace(
+        window, features_uT=window.features_uT + rng.normal(0.0, 20.0, window.features_uT.shape)
+    )
+    for precision in (None, 0.0, 1.0):
+        assert_same_as_exhaustive(planes, window, courses, PosePrior(), plain_error(len(window), precision), 10.0)
 
 
 def test_the_walkable_area_is_kept_to(grid_of: Callable, walk_on: Callable) -> None:
