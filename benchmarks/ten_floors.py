@@ -206,6 +206,9 @@ def report(answers: Sequence[Answer]) -> int:
             f"{np.median([row.radius_95_m for row in rows]):9.2f} m "
             f"{cpu_s.mean():7.2f} ± {cpu_s.std() / np.sqrt(len(cpu_s)):.2f} s     {times:5.2f} ± {times_se:.2f}"
         )
+    fixes = {count: np.mean([row.is_fix for row in answers if row.floors == count]) for count in counts}
+    called = ", ".join(f"{100 * part:.0f} % among {count}" for count, part in fixes.items())
+    print(f"windows called a fix (no target): {called}")
     verdict = "PASS" if passed else "FAIL"
     print(f"processor time grows no faster than the floors  {verdict}")
     p, se = share([row.within for row in answers if row.floors == counts[-1]])

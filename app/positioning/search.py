@@ -30,7 +30,7 @@ Nodes = NDArray[np.int32]
 CAPACITY = 400_000  # poses kept at most
 BUDGET = 4_000_000_000  # values compared per plane at most: poses or nodes, times samples, times components
 _TOP_SHARE = 0.25  # of the budget, for the nodes the search starts from
-_NODES_PER_POSE = 2  # how many nodes of a level may be followed, per pose of the capacity
+_MOST_NODES = 800_000  # of a level that may be followed on a plane
 _TOP, _OFFSET_TOP = 4, 4  # levels to start from: what larger blocks hold is hardly ever excluded
 _SHARE = 1.0  # of a block's side, by which a group of courses may spread the samples
 _BEAM = 16
@@ -258,9 +258,20 @@ class _Sweep:
         if not self.assumed:
             found = [self._seed(on_plane) for on_plane in on_planes]
         starts = [self._start(on_plane) for on_plane in on_planes]
-        for k in np.argsort([start.least for start in starts], kind="stable"):
+        promise = [start.least for start in starts]
+        if len(on_planes) > 1:  # a good pose of the right plane first: the others are pruned by it
+            promise = [self._dive(on_plane, start) for on_plane, start in zip(on_planes, starts, strict=True)]
+        for k in np.argsort(promise, kind="stable"):
             found[k] = self._run(on_planes[k], starts[k], *found[k])
         return found
+
+    def _dive(self, on_plane: _OnPlane, start: _Start) -> float:
+        """The cost of a good pose of a plane."""
+        if not len(start.nodes):
+            return np.inf
+        _, cost = on_plane.dive(start.nodes, start.bounds, on_plane.top, np.inf, _WIDE)
+        self._improve(cost)
+        return cost
 
     def _seed(self, on_plane: _OnPlane) -> tuple[Nodes, Array]:
         pose, cost = on_plane.seed()
@@ -336,8 +347,8 @@ class _Sweep:
 
     def _fit(self, on_plane: _OnPlane, nodes: Nodes, bounds: Array, level: int) -> tuple[Nodes, Array]:
         """No more than there is room for: the window shrinks."""
-        if len(nodes) > _NODES_PER_POSE * self.capacity:
-            keep = self._keep(bounds, _NODES_PER_POSE * self.capacity)
+        if len(nodes) > _MOST_NODES:
+            keep = self._keep(bounds, _MOST_NODES)
             self.miss(on_plane.poses(nodes[~keep], level), bounds[~keep])
             nodes, bounds = nodes[keep], bounds[keep]
         return nodes, bounds
