@@ -260,18 +260,21 @@ class _Sweep:
         starts = [self._start(on_plane) for on_plane in on_planes]
         promise = [start.least for start in starts]
         if len(on_planes) > 1:  # a good pose of the right plane first: the others are pruned by it
-            promise = [self._dive(on_plane, start) for on_plane, start in zip(on_planes, starts, strict=True)]
+            for k, (on_plane, start) in enumerate(zip(on_planes, starts, strict=True)):
+                pose, promise[k] = self._dive(on_plane, start)
+                if promise[k] < self.best:
+                    found[k] = pose, np.array([promise[k]])
+                    self._improve(promise[k])
         for k in np.argsort(promise, kind="stable"):
             found[k] = self._run(on_planes[k], starts[k], *found[k])
         return found
 
-    def _dive(self, on_plane: _OnPlane, start: _Start) -> float:
-        """The cost of a good pose of a plane."""
+    @staticmethod
+    def _dive(on_plane: _OnPlane, start: _Start) -> tuple[Nodes, float]:
+        """A good pose of a plane (1, 3) and its cost."""
         if not len(start.nodes):
-            return np.inf
-        _, cost = on_plane.dive(start.nodes, start.bounds, on_plane.top, np.inf, _WIDE)
-        self._improve(cost)
-        return cost
+            return start.nodes, np.inf
+        return on_plane.dive(start.nodes, start.bounds, on_plane.top, np.inf, _WIDE)
 
     def _seed(self, on_plane: _OnPlane) -> tuple[Nodes, Array]:
         pose, cost = on_plane.seed()
