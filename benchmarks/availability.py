@@ -41,7 +41,6 @@ from app.positioning.fix import LocateOptions
 from app.positioning.floors import SearchableFloor, reduce_floor
 from app.positioning.locate import prepare_floors, warm_up
 from app.positioning.matching import Matched, match
-from app.positioning.techniques import ABL_UNIFORM_MULTIPLE
 from app.positioning.verdict import conclude
 from app.positioning.window import Composition, Window, WindowFrame
 from app.synthetic.building import SyntheticBuilding, make_building
@@ -99,7 +98,7 @@ MAPPED = Technique("... mapped", SHARES, "probability")
 RADIUS = Technique("radius", RADII_M, "m", smaller_is_surer=True)
 TECHNIQUES = (*MLR, *ABL, *ABL_MASS, POSTERIOR, MAPPED, RADIUS)
 DEFAULT_MLR = next(t for t in MLR if t.parameter_m == DEFAULTS.mlr_min_distance_m)
-DEFAULT_ABL = next(t for t in ABL if t.parameter_m == DEFAULTS.abl_bin_m)
+DEFAULT_ABL = next(t for t in ABL_MASS if t.parameter_m == DEFAULTS.abl_bin_m)
 COMPARED = (DEFAULT_MLR, DEFAULT_ABL, POSTERIOR, MAPPED, RADIUS)
 
 
@@ -136,7 +135,7 @@ def answer_all_ways(
     asked: Window, pose: Pose, floors: Sequence[SearchableFloor], composition: Composition, rows: Rows
 ) -> None:
     """Match once; the techniques' other parameters are answered from the same match."""
-    sweeping = replace(DEFAULTS, mlr_ratio=RATIOS[-1], abl_threshold=0.0)
+    sweeping = replace(DEFAULTS, mlr_ratio=RATIOS[-1], abl_min_probability=0.0)
     matched = match(asked, floors, floors[0].components, composition, None, sweeping)
     belief = believe(matched)
     fix = conclude(matched, belief, ("ml", "mlr", "abl"), sweeping)
@@ -172,12 +171,12 @@ def ratios(matched: Matched, known: Belief) -> dict[Technique, float]:
     What `believe` does for the one distance it is asked for. Never more than was searched for: where no rival was
     found, all that is known is that it is as much.
     """
-    optima = believing._optima(matched, believing.pose_gaussian(matched))
+    optima = believing.find_optima(matched, believing.pose_gaussian(matched))
     found = {}
     for technique in MLR:
         assert technique.parameter_m is not None
         options = replace(matched.options, mlr_min_distance_m=technique.parameter_m)
-        belief = replace(known, log_ratio=believing._log_ratio(optima, technique.parameter_m))
+        belief = replace(known, log_ratio=believing.log_ratio(optima, technique.parameter_m))
         found[technique] = min(mlr_estimate(matched, belief, options).ratio or 0.0, RATIOS[-1])
     return found
 
@@ -326,7 +325,10 @@ def report_shipped(answered: Answered) -> bool:
     """What the defaults of `locate` do: MLR and ABL as they answer, and the status "fix"; whether that is reliable."""
     rules = {
         f"MLR > {DEFAULTS.mlr_ratio:g}": (answered.sure[DEFAULT_MLR] > DEFAULTS.mlr_ratio, DEFAULT_MLR),
-        f"ABL >= {ABL_UNIFORM_MULTIPLE:g}": (answered.sure[DEFAULT_ABL] >= ABL_UNIFORM_MULTIPLE, DEFAULT_ABL),
+        f"ABL >= {DEFAULTS.abl_min_probability:g}": (
+            answered.sure[DEFAULT_ABL] >= DEFAULTS.abl_min_probability,
+            DEFAULT_ABL,
+        ),
         "status fix": (answered.is_fix, POSTERIOR),
     }
     for name, (given, technique) in rules.items():

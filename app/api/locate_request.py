@@ -135,9 +135,12 @@ class Area(RequestModel):
 class OptionsBody(RequestModel):
     """Parameters of the techniques (Shockley 8.2, 8.3), and what is known of the window's errors."""
 
-    mlr_ratio: Annotated[Finite, Field(ge=1, le=1e12)] = 2.0
+    mlr_ratio: Annotated[Finite, Field(ge=1, le=1e12)] = 10.0
     mlr_min_distance_m: Annotated[Finite, Field(gt=0, le=10_000)] = 5.0
-    abl_threshold: Annotated[Finite, Field(ge=0, le=1e9)] | None = None
+    abl_threshold: Annotated[
+        Finite | None, Field(ge=0, le=1e9, description="least peak of the likelihood, as a multiple of the uniform one")
+    ] = None
+    abl_min_probability: Annotated[Finite, Field(ge=0, le=1, description="that the heaviest bin must hold")] = 0.7
     abl_bin_m: Annotated[Finite, Field(gt=0, le=1000)] = 2.0
     gate_probability: Annotated[
         Finite, Field(gt=0, lt=1, description="of the chi-square gate: a right match fails it once in 1 / (1 - this)")
@@ -244,6 +247,7 @@ def core_options(body: LocateBody, clock: Callable[[], float]) -> LocateOptions:
         mlr_ratio=asked.mlr_ratio,
         mlr_min_distance_m=asked.mlr_min_distance_m,
         abl_threshold=asked.abl_threshold,
+        abl_min_probability=asked.abl_min_probability,
         abl_bin_m=asked.abl_bin_m,
         gate_probability=asked.gate_probability,
         feature_rms_uT=asked.feature_rms_ut,

@@ -19,7 +19,7 @@ from app.positioning.posterior import (
 from app.positioning.refine import POSE, PoseGaussian, Refined, refine_poses
 from app.positioning.scoring import pose_residuals
 
-__all__ = ["Belief", "BelievedMode", "believe"]
+__all__ = ["Belief", "BelievedMode", "Optimum", "believe", "find_optima", "log_ratio", "pose_gaussian"]
 
 MODES_APART_M = 2.0  # nearer places are one
 _MODES = 8
@@ -67,7 +67,7 @@ def believe(matched: Matched) -> Belief:
     """Refine, sum and normalise the candidates' posterior."""
     found = matched.candidates
     gaussian = pose_gaussian(matched)
-    optima = _optima(matched, gaussian)
+    optima = find_optima(matched, gaussian)
     peak = max(optima[0].objective, float(matched.score[0]))
     relative = np.exp(matched.score - peak)
     cell = np.array([plane.resolution_m for plane in matched.planes])
@@ -95,7 +95,7 @@ def believe(matched: Matched) -> Belief:
         modes=tuple(sorted(modes, key=lambda mode: -mode.probability)),
         best=best,
         lattice_mass=relative / relative.sum(),
-        log_ratio=_log_ratio(optima, matched.options.mlr_min_distance_m),
+        log_ratio=log_ratio(optima, matched.options.mlr_min_distance_m),
         unmapped=nowhere + (1.0 - nowhere) * poor,
         off_map_distance2=elsewhere.distance2,
         off_map_scalars=elsewhere.scalars,
@@ -104,23 +104,25 @@ def believe(matched: Matched) -> Belief:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Optimum:
+class Optimum:
+    """A local optimum of the posterior: `objective` counts the priors in, as the candidates' scores do."""
+
     plane: int
     fine: Refined
-    objective: float  # height and course prior counted in, as the candidates' scores have them
+    objective: float
 
     def believed(self, probability: float) -> BelievedMode:
         fine = self.fine
         return BelievedMode(self.plane, fine.pose[0], float(fine.log_l[0]), float(fine.distance2[0]), probability, fine)
 
 
-def _optima(matched: Matched, gaussian: PoseGaussian) -> list[_Optimum]:
+def find_optima(matched: Matched, gaussian: PoseGaussian) -> list[Optimum]:
     """Local optima of the posterior, the best first: refined from the best candidates of every place and heading."""
     starts = distinct_poses(
         matched.candidates.plane, matched.position_m, matched.courses.heading_rad[matched.candidates.course],
         START_APART_M, START_APART_RAD, _STARTS,
     )  # fmt: skip
-    kept: list[_Optimum] = []
+    kept: list[Optimum] = []
     for each in sorted(_refined(matched, gaussian, starts), key=lambda each: -each.objective):
         pose = each.fine.pose[0]
         again = any(
@@ -134,7 +136,7 @@ def _optima(matched: Matched, gaussian: PoseGaussian) -> list[_Optimum]:
     return kept
 
 
-def _refined(matched: Matched, gaussian: PoseGaussian, candidates: NDArray[np.int64]) -> list[_Optimum]:
+def _refined(matched: Matched, gaussian: PoseGaussian, candidates: NDArray[np.int64]) -> list[Optimum]:
     """Candidates, refined; those of a plane together."""
     found, courses = matched.candidates, matched.courses
     refined = []
@@ -150,24 +152,24 @@ def _refined(matched: Matched, gaussian: PoseGaussian, candidates: NDArray[np.in
         floor = matched.floors[matched.plane_floor[k]]
         fine = refine_poses(floor, plane, matched.window, start, gaussian, matched.error)
         height = _height_log(matched, k)
-        refined += [_Optimum(k, fine.only(m), float(fine.objective[m]) + height) for m in range(len(here))]
+        refined += [Optimum(k, fine.only(m), float(fine.objective[m]) + height) for m in range(len(here))]
     return refined
 
 
-def _leaders(optima: list[_Optimum]) -> list[_Optimum]:
+def _leaders(optima: list[Optimum]) -> list[Optimum]:
     """The best optimum of every place, places MODES_APART_M apart; the best first."""
-    leaders: list[_Optimum] = []
+    leaders: list[Optimum] = []
     for each in optima:
         if len(leaders) < _MODES and not any(_near(each, other, MODES_APART_M) for other in leaders):
             leaders.append(each)
     return leaders
 
 
-def _near(a: _Optimum, b: _Optimum, distance_m: float) -> bool:
+def _near(a: Optimum, b: Optimum, distance_m: float) -> bool:
     return a.plane == b.plane and bool(np.linalg.norm(a.fine.pose[0, :2] - b.fine.pose[0, :2]) < distance_m)
 
 
-def _log_ratio(optima: list[_Optimum], apart_m: float) -> float | None:
+def log_ratio(optima: list[Optimum], apart_m: float) -> float | None:
     """Log ratio of the best optimum to the best one elsewhere (Shockley 8.2); None where nothing else was found."""
     rivals = [each.objective for each in optima if not _near(each, optima[0], apart_m)]
     return optima[0].objective - max(rivals) if rivals else None
@@ -203,7 +205,7 @@ def pose_gaussian(matched: Matched) -> PoseGaussian:
     return PoseGaussian(mean, precision, free)
 
 
-def _laplace_mass(matched: Matched, gaussian: PoseGaussian, optimum: _Optimum, peak: float) -> float:
+def _laplace_mass(matched: Matched, gaussian: PoseGaussian, optimum: Optimum, peak: float) -> float:
     """The optimum's mass in units of exp(peak) per pose, as if the lattice were infinitely fine.
 
     A heading of the lattice weighs exp(log prior), a scale or a drift what its prior holds: theirs have a constant.

@@ -11,7 +11,7 @@ from app.positioning.mad import least_deviation, mean_absolute_deviation
 from app.positioning.matching import Matched
 from app.positioning.misfit import residual_rms_uT
 from app.positioning.scoring import pose_residuals
-from app.positioning.techniques import ABL_UNIFORM_MULTIPLE, best_bin, peak_over_uniform
+from app.positioning.techniques import best_bin, peak_over_uniform
 
 __all__ = ["abl_estimate", "contour_estimate", "mad_estimate", "ml_estimate", "mlr_estimate"]
 
@@ -46,7 +46,7 @@ def mlr_estimate(matched: Matched, belief: Belief, options: LocateOptions) -> Ml
 
 
 def abl_estimate(matched: Matched, belief: Belief, options: LocateOptions) -> AblEstimate:
-    """The mean place of the heaviest bin, if the likelihood has a peak at all."""
+    """The mean place of the heaviest bin, if it holds enough of the likelihood."""
     found, mass = matched.candidates, belief.lattice_mass
     strongest, winner, lead = None, 0, -1.0
     tables, cells = [], sum(plane.shape[0] * plane.shape[1] for plane in matched.planes)
@@ -60,10 +60,16 @@ def abl_estimate(matched: Matched, belief: Belief, options: LocateOptions) -> Ab
         if held.mass > lead:
             lead, winner = held.mass, int(k)
             strongest = (column0 + held.column, row0 + held.row)
-    threshold = ABL_UNIFORM_MULTIPLE if options.abl_threshold is None else options.abl_threshold
     multiple = peak_over_uniform(np.concatenate(tables), cells)
-    if multiple < threshold or strongest is None:
-        reason = f"the likelihood is spread out: its peak is {multiple:.3g} times the uniform share, not {threshold:g}"
+    if options.abl_threshold is not None and multiple < options.abl_threshold:
+        wanted = f"not {options.abl_threshold:g}"
+        reason = f"the likelihood is spread out: its peak is {multiple:.3g} times the uniform share, {wanted}"
+        return AblEstimate(False, lead, multiple, reason=reason)
+    if lead < options.abl_min_probability or strongest is None:
+        reason = (
+            f"the likelihood is spread out: its heaviest {options.abl_bin_m:g} m hold {lead:.2f} of it, not "
+            f"{options.abl_min_probability:g}"
+        )
         return AblEstimate(False, lead, multiple, reason=reason)
     plane = matched.planes[winner]
     place = np.array(plane.origin_m) + plane.resolution_m * np.array(strongest)

@@ -21,6 +21,8 @@ Status = Literal["fix", "ambiguous", "inconsistent", "unmapped"]
 class LocateOptions:
     """Parameters of the techniques (Shockley 8.2, 8.3), of the gate, and what is known of the window's errors.
 
+    The techniques' defaults follow from benchmarks/availability.py.
+
     bias_sd_uT                   what is not known of the sensor's constant offset, per axis, beyond what surveys of the
                                  map differ by
     step_scale_sd                relative sd of the scale of the window's displacements
@@ -29,10 +31,11 @@ class LocateOptions:
     out_of_time                  asked now and then; once it says so the search ends with what it has
     """
 
-    mlr_ratio: float = 2.0
+    mlr_ratio: float = 10.0
     mlr_min_distance_m: float = 5.0
-    abl_threshold: float | None = None  # None: the default of techniques.py, as a multiple of the uniform mass
     abl_bin_m: float = 2.0
+    abl_min_probability: float = 0.7  # that the heaviest bin must hold
+    abl_threshold: float | None = None  # least peak of the likelihood, as a multiple of the uniform one; None: any
     gate_probability: float = 0.997  # chi-square gate on the best pose (Shockley 8.5)
     feature_rms_uT: float | None = (
         None  # a feature whose best match is worse than this is unknown; None: the gate judges

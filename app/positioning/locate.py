@@ -160,6 +160,8 @@ def _check_options(prior: Prior | None, options: LocateOptions) -> None:
     faults += [
         Fault(f"/options/{name}", "must be positive") for name, value in positive.items() if not 0.0 < value < np.inf
     ]
+    if not 0.0 <= options.abl_min_probability <= 1.0:
+        faults.append(Fault("/options/abl_min_probability", "must lie between 0 and 1"))
     if not 0.0 < options.gate_probability < 1.0:
         faults.append(Fault("/options/gate_probability", "must lie between 0 and 1"))
     if faults:

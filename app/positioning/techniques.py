@@ -13,11 +13,9 @@ from scipy.special import gammaincinv
 from app.geometry import Array
 
 __all__ = [
-    "ABL_UNIFORM_MULTIPLE", "Bin", "Rival", "StretchBin", "best_bin", "best_stretch_bin", "chi_square_limit",
+    "Bin", "Rival", "StretchBin", "best_bin", "best_stretch_bin", "chi_square_limit",
     "likelihood_rival", "normalised_mass", "peak_over_uniform",
 ]  # fmt: skip
-
-ABL_UNIFORM_MULTIPLE = 100.0  # ABL answers when the likeliest cell holds this many times the uniform mass
 
 
 class Rival(NamedTuple):

@@ -26,7 +26,8 @@ def walks_with(structure: ErrorStructure, count: int, length_m: float, seed: int
 
 
 @pytest.mark.parametrize(
-    "truth", [ErrorStructure(0.3, 0.4, 0.2, 2.0), ErrorStructure(0.0, 0.6, 0.4, 1.0), ErrorStructure(0.0, 0.0, 1.0, 1.0)]
+    "truth",
+    [ErrorStructure(0.3, 0.4, 0.2, 2.0), ErrorStructure(0.0, 0.6, 0.4, 1.0), ErrorStructure(0.0, 0.0, 1.0, 1.0)],
 )
 def test_shares_and_length_are_found_again(truth: ErrorStructure) -> None:
     found = held_out_structure(walks_with(truth, 60, 50.0, seed=0))
