@@ -1,5 +1,7 @@
 """Hyper-parameters by surveys left out: walks whose labels err, and walks whose labels do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,17 @@ def test_choice_predicts_left_out_surveys_and_new_walks_better_where_labels_err(
         variance = np.concatenate([v.sd_uT**2 for v in found])[near] + grid.noise_sd_uT**2
         nlpd.append(np.mean(np.log(variance) + error**2 / variance))
     assert nlpd[0] < nlpd[1] + 0.02
+
+
+def test_a_likelihood_that_takes_the_field_for_errors_does_not_compete(vague):
+    """Of such a map nothing would count as measured, however well it predicts."""
+    observed, learned = vague
+    hyper = replace(learned.hyper, signal_sd_uT=0.2 * learned.hyper.signal_sd_uT, walk_ratio=20.0, bias_ratio=10.0)
+    chosen = choose_by_held_out_surveys(observed, replace(learned, hyper=hyper), SPEC, lambda *_: None)
+    was, now = hyper, chosen.hyper
+    assert now.bias_ratio + now.walk_ratio + now.white_ratio < 1.0
+    total = [np.square(h.signal_sd_uT) * (1 + h.bias_ratio + h.walk_ratio + h.white_ratio) for h in (was, now)]
+    np.testing.assert_allclose(total[1], total[0])
 
 
 def test_precise_walks_keep_the_most_likely():
