@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.field.error_structure import LABELS_ERR, POSE_LEAVES_M, ErrorStructure, as_a_pose_leaves_it
 from app.field.estimate import ambient_field_uT
 from app.field.fit import fit_map
 from app.field.hard_iron import HardIron
@@ -118,3 +119,13 @@ def test_a_large_map_is_judged_by_some_of_its_squares():
     kept = np.concatenate([walk.position_m for walk in part])
     assert np.ptp(kept[:, 0]) > 900.0
     assert np.ptp(kept[:, 1]) > 900.0
+
+
+def test_errors_of_labels_are_short_for_a_pose():
+    """Where labels err, what a window's pose cannot take is short; where they do not, errors are what surveys show."""
+    vague, precise = (fit_map(straight_walks(np.random.default_rng(0), sd_m), SPEC).grid for sd_m in (1.5, 0.0))
+    assert np.sum(vague.noise_sd_uT**2) > LABELS_ERR * np.sum(vague.prior_sd_uT**2)
+    assert vague.error_structure.walk_length_m <= POSE_LEAVES_M
+    assert np.sum(precise.noise_sd_uT**2) < LABELS_ERR * np.sum(precise.prior_sd_uT**2)
+    long = ErrorStructure(0.1, 0.7, 0.2, 3.0)
+    assert as_a_pose_leaves_it(long) == replace(long, walk_length_m=POSE_LEAVES_M)
