@@ -125,8 +125,8 @@ def _acceptance_table(summaries: Sequence[Summary]) -> Table:
 
 def _reliability_table(summaries: Sequence[Summary]) -> Table:
     table = Table("window", "ground", "searched", "windows", "50 %", "68 %", "90 %", "95 %",
-                  title="Truth within the radii, of windows not called unmapped (in brackets: expected, floor's probability "
-                  "counted in)")  # fmt: skip
+                  title="Truth within the radii, of windows not called unmapped (in brackets: expected, the floor's "
+                  "probability counted in)")  # fmt: skip
     for length, ground, summary in _rows(summaries):
         for searched, found in (("all floors", summary.reliability), ("prior disc", summary.disc_reliability)):
             table.add_row(length, ground, searched, str(found.windows), *_reliability_cells(found))

@@ -202,7 +202,7 @@ def judge_walk(
 
 
 def disc_centre_m(truth_m: Array, radius_m: float, name: str) -> Array:
-    """A place drawn evenly from a disc about the truth, always the same for a name; its sd per axis is half the radius."""
+    """A place drawn evenly from a disc about the truth, one for each name; its sd per axis is half the radius."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     along_m, angle_rad = radius_m * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
     return np.asarray(truth_m + along_m * np.array([np.cos(angle_rad), np.sin(angle_rad)]))
