@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.field.error_structure import LABELS_ERR, POSE_LEAVES_M, ErrorStructure, as_a_pose_leaves_it
+from app.field.error_structure import LABELS_ERR, LABELS_SD_M, POSE_LEAVES_M, ErrorStructure, as_a_pose_leaves_it
 from app.field.estimate import ambient_field_uT
 from app.field.fit import fit_map
 from app.field.hard_iron import HardIron
@@ -126,6 +126,8 @@ def test_errors_of_labels_are_short_for_a_pose():
     vague, precise = (fit_map(straight_walks(np.random.default_rng(0), sd_m), SPEC).grid for sd_m in (1.5, 0.0))
     assert np.sum(vague.noise_sd_uT**2) > LABELS_ERR * np.sum(vague.prior_sd_uT**2)
     assert vague.error_structure.walk_length_m <= POSE_LEAVES_M
+    assert vague.error_structure.position_sd_m == LABELS_SD_M
     assert np.sum(precise.noise_sd_uT**2) < LABELS_ERR * np.sum(precise.prior_sd_uT**2)
     long = ErrorStructure(0.1, 0.7, 0.2, 3.0)
-    assert as_a_pose_leaves_it(long) == replace(long, walk_length_m=POSE_LEAVES_M)
+    assert precise.error_structure.position_sd_m == 0.0
+    assert as_a_pose_leaves_it(long) == replace(long, walk_length_m=POSE_LEAVES_M, position_sd_m=LABELS_SD_M)
