@@ -162,3 +162,17 @@ def test_a_field_that_is_nowhere_here_overflows_nothing(grid_of: Callable, walk_
         assert fix.status in ("unmapped", "inconsistent")
         assert fix.posterior is not None
         assert fix.posterior.off_map_probability > 0.99
+
+
+def test_radii_hold_what_labels_of_the_map_err_by(grid_of: Callable, walk_on: Callable) -> None:
+    """Two metres per axis: 68 % of a Gaussian in the plane lie within 1.51 sds, 95 % within 2.45."""
+    world = smooth_world(grid_of, 2)
+    vague = dataclasses.replace(world, error_structure=dataclasses.replace(world.error_structure, position_sd_m=2.0))
+    window = walk_on(np.random.default_rng(4), world, length_m=8.0, samples=33).window
+    sure, unsure = (locate(window, [prepare_floor("a", grid)]).posterior for grid in (world, vague))
+    assert sure is not None
+    assert unsure is not None
+    assert sure.radius_95_m < 0.5
+    assert unsure.radius_68_m == pytest.approx(1.51 * 2.0, rel=0.1)
+    assert unsure.radius_95_m == pytest.approx(2.45 * 2.0, rel=0.1)
+    np.testing.assert_allclose(unsure.position_m, sure.position_m, atol=0.3)
