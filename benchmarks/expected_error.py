@@ -34,7 +34,9 @@ from app.field.localizability import glm, glm_average, glm_ratio_of_means
 from app.positioning.fix import Prior
 from app.positioning.locate import locate, prepare_floor
 from app.positioning.window import Window
-from app.services.evaluate_walks import WALK_SUFFIXES, EvaluationPlan, calibrate_sessions, cut_windows, hold_out
+from app.services.evaluate_walks import EvaluationPlan
+from app.services.held_out_walks import WALK_SUFFIXES, calibrate_sessions, hold_out
+from app.services.judge_windows import cut_windows
 from app.survey.read import read_survey
 from app.synthetic.building import SyntheticBuilding, make_building
 from app.synthetic.sensors import Pose, window
@@ -168,7 +170,7 @@ def real_windows(folder: Path) -> np.ndarray:
                 path = positions[part]
                 if grid.at(path).measured.mean() < 0.5:
                     continue
-                fix = locate(asked, [floor], composition=plan.composition, techniques=())
+                fix = locate(asked, [floor], composition=plan.question.composition, techniques=())
                 assert fix.ml is not None
                 actual = float(np.linalg.norm(np.array(fix.ml.position_m[:2]) - path[-1, :2]))
                 bound = float(np.sqrt(np.trace(window_covariance_m2(grid, path, model))))

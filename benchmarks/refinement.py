@@ -22,7 +22,7 @@ from app.field.refinement import Refinement, refine
 from app.field.samples import Samples
 from app.field.session_bias import estimate_session_biases
 from app.field.spec import MapSpec
-from app.services.evaluate_walks import WALK_SUFFIXES, calibrate_sessions, hold_out
+from app.services.held_out_walks import WALK_SUFFIXES, calibrate_sessions, hold_out
 from app.services.map_scores import held_out_walk, nlpd_gain, score_map
 from app.survey.read import read_survey
 from app.synthetic.building import make_building

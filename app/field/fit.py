@@ -11,7 +11,7 @@ from app.field.compromise_engine import estimate_by_compromise
 from app.field.conflict import quality_layers
 from app.field.consistency import check_surveys
 from app.field.drift import out_of_date_regions
-from app.field.error_structure import ErrorStructure
+from app.field.error_structure import ErrorStructure, as_a_pose_leaves_it, labels_err
 from app.field.estimate import FieldEstimate
 from app.field.exact import estimate_by_exact
 from app.field.grid import FieldGrid
@@ -88,7 +88,10 @@ def fit_map(
     correlation_m = error_correlation_m(held_out)
     scored = score(held_out, {walk.survey_id: walk.sample_field_uT for walk in observed})
     names, frame = COMPONENT_NAMES[spec.components], estimate.frame
-    grid = _grid(observed, estimate, spec, noise_sd_uT, correlation_m, held_out_structure(held_out))
+    structure = held_out_structure(held_out)
+    if labels_err(noise_sd_uT, estimate.prior_sd_uT):
+        structure = as_a_pose_leaves_it(structure)
+    grid = _grid(observed, estimate, spec, noise_sd_uT, correlation_m, structure)
     reports = check_surveys(held_out, names, correlation_m)
     about_labels = {"refinement": refinement.as_json()} if refinement else {}
     return FittedMap(

@@ -4,7 +4,9 @@ A likelihood believes its model of the errors. Those of walks whose labels err b
 field itself, which no Ornstein-Uhlenbeck process is: the likelihood then takes the field to be too rough or the errors
 too long. Predictions of surveys from the others do not depend on such belief (Rasmussen & Williams 2006, 5.4.2), and
 they cost a subtraction. So the most likely hyper-parameters compete with a few that suit such labels, and the ones
-that predict left-out surveys best are used. Where errors are small the likelihood is right and nothing is tried.
+that predict left-out surveys best are used. The most likely have to predict clearly better, and do not compete where
+they take more of the variance for errors than for the field: of such a map nothing counts as measured. Where errors
+are small the likelihood is right and nothing is tried.
 """
 
 from collections.abc import Sequence
@@ -36,7 +38,7 @@ and larger errors predicted left-out walks of a mall a little better; but smooth
 WALK_LENGTH_M = 3.0
 WHITE_SHARE, OFFSET_SHARE = 0.02, 0.15
 WORTH_NATS = 0.01
-"""Less than this, per observation and component, and the most likely stay."""
+"""By less than this, per observation and component, the most likely do not prove themselves where errors are large."""
 MOST_OBSERVATIONS = 20_000
 SQUARE_M = 50.0
 RASTER_M = 10.0
@@ -52,7 +54,7 @@ def choose_by_held_out_surveys(walks: Sequence[Walk], learned: Learned, spec: Ma
     if not flat or not large or len(walks) < FEWEST_SURVEYS:
         return learned
     part = _thinned(walks)
-    best, least = learned, held_out_nlpd(part, learned, spec) - WORTH_NATS
+    best, least = learned, held_out_nlpd(part, learned, spec) + WORTH_NATS if share < 1.0 else np.inf
     for step, (length_m, share) in enumerate(product(LENGTHS_M, ERROR_SHARES)):
         progress(step / len(LENGTHS_M) / len(ERROR_SHARES), "choosing length and noise by surveys left out")
         tried = _with(learned, spec, length_m, share)
@@ -91,10 +93,14 @@ def _nlpd(error_uT: Array, variance_uT2: Array) -> Array:
 
 
 def _with(learned: Learned, spec: MapSpec, length_m: float, share: float) -> Learned:
-    """The same signal with another length and other errors."""
+    """Another length, and the same variance in all, shared out otherwise between signal and errors."""
     correlated = spec.noise == "walk"
+    was = learned.hyper
+    told_apart = 1.0 + was.bias_ratio + was.walk_ratio + was.white_ratio
+    shared_out = 1.0 + OFFSET_SHARE + share + (WHITE_SHARE if correlated else 0.0)
     hyper = replace(
-        learned.hyper,
+        was,
+        signal_sd_uT=was.signal_sd_uT * np.sqrt(told_apart / shared_out),
         length_m=length_m,
         white_ratio=WHITE_SHARE if correlated else share,
         walk_ratio=share if correlated else 0.0,

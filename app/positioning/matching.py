@@ -28,7 +28,7 @@ from app.positioning.search import Candidates, PosePrior, search
 from app.positioning.window import Composition, Window, course_yaw_rad
 from app.positioning.window_error import WindowError, differenced, window_error
 
-__all__ = ["Matched", "device_turn_rad", "match"]
+__all__ = ["Matched", "device_turn_rad", "match", "prior_mass"]
 
 _KEPT_NATS = 10.0  # poses this much less likely than the best, as they are searched, are left out of the belief
 _SAMPLES = 40  # of a window of some length: more are averaged, as long as they stay near each other
@@ -150,7 +150,7 @@ def match(
         distance2=distance2[order],
         best=int(np.argmax(aligned)),
         pose_prior=pose_prior,
-        prior_mass=_prior_mass(planes, pose_prior, courses),
+        prior_mass=prior_mass(planes, pose_prior, courses),
     )
 
 
@@ -232,7 +232,8 @@ def _walkable(floors: Sequence[SearchableFloor], options: LocateOptions) -> list
     return masks
 
 
-def _prior_mass(planes: Sequence[Plane], prior: PosePrior, courses: Courses) -> float:
+def prior_mass(planes: Sequence[Plane], prior: PosePrior, courses: Courses) -> float:
+    """Of the lattice under the priors, each pose weighing exp(log prior); never zero."""
     total = 0.0
     for k, plane in enumerate(planes):
         ny, nx = plane.shape

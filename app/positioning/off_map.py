@@ -2,11 +2,13 @@
 
 The field beyond the map is taken to be like the mapped one: the ambient mean, the map's prior variance, and a length
 scale at which it is as steep as the map is. So smooth a field gives correlated samples, and the evidence charges for
-the independent numbers a window holds, not for its samples. With the same errors on both sides, its ratio to the
-evidence of the map's poses is a Bayes factor (Kuevor and Shockley have no such hypothesis).
+the independent numbers a window holds, not for its samples. With the same errors on both sides, those of a typical
+measured cell, its ratio to the evidence of the map's poses is a Bayes factor (Kuevor and Shockley have no such
+hypothesis). A window that is on the map ends where something was measured: its prior odds are against those poses,
+so that empty cells of a grid do not make this hypothesis the likelier beforehand.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +20,7 @@ from app.geometry import Array
 from app.positioning.features import reduce_variance
 from app.positioning.floors import Plane
 from app.positioning.lattice import single_course, turn_window
-from app.positioning.matching import Matched
+from app.positioning.matching import Matched, prior_mass
 
 __all__ = ["Evidence", "OffMap", "ProcessPrior", "off_map", "process_evidence", "process_prior"]
 
@@ -62,8 +64,7 @@ def off_map(matched: Matched, peak: float) -> OffMap:
     variance = scale2 * reduce_variance(
         grid.ambient_uT, np.square(grid.prior_sd_uT), grid.components, window.components
     )
-    noise = scale2 * reduce_variance(grid.ambient_uT, np.square(floor.noise_sd_uT), grid.components, window.components)
-    sd = np.sqrt(error.own_share * float(noise.mean()) + window.noise_variance_uT2)
+    sd = np.sqrt(error.own_share * plane.typical_variance_uT2 + window.noise_variance_uT2)
     correlated = sd[:, None] * error.correlation * sd
     headings = single_course(np.unique(matched.courses.heading_rad))
     residual = turn_window(window, headings, plane.resolution_m).features_uT - plane.ambient_uT
@@ -74,10 +75,17 @@ def off_map(matched: Matched, peak: float) -> OffMap:
     weight = np.exp(log_heading)
     odds = OFF_MAP_PRIOR / (1.0 - OFF_MAP_PRIOR)
     return OffMap(
-        mass=float(odds * matched.prior_mass * (weight @ relative) / weight.sum()),
+        mass=float(odds * _measured_mass(matched) * (weight @ relative) / weight.sum()),
         distance2=float(fit.distance2.min()),
         scalars=float(window.features_uT.size),
     )
+
+
+def _measured_mass(matched: Matched) -> float:
+    """The part of the prior's mass that ends on measured cells."""
+    allowed = matched.pose_prior.walkable or [np.ones(plane.shape, dtype=np.bool_) for plane in matched.planes]
+    measured = [mask & plane.measured for mask, plane in zip(allowed, matched.planes, strict=True)]
+    return prior_mass(matched.planes, replace(matched.pose_prior, walkable=measured), matched.courses)
 
 
 def _heading_log(matched: Matched, heading_rad: Array) -> Array:

@@ -15,10 +15,9 @@ import numpy as np
 from app.field.fit import fit_map
 from app.field.session_bias import estimate_session_biases
 from app.field.spec import MapSpec
-from app.services.evaluate_walks import (
+from app.services.evaluate_walks import NOISES, EvaluationPlan
+from app.services.held_out_walks import (
     HELD_OUT_EVERY,
-    NOISES,
-    EvaluationPlan,
     Told,
     calibrate_sessions,
     collected,

@@ -5,28 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.services.evaluate_walks import Evaluation, JudgedWindow, Place
+from app.services.acceptance import Acceptance, reachable_acceptance
+from app.services.evaluate_walks import Evaluation
+from app.services.judge_windows import SHARES, Answer, JudgedWindow, Place
+from app.services.rates import Rate, rate
 
-__all__ = ["Rate", "Summary", "TechniqueSummary", "rate", "summarise"]
+__all__ = ["Reliability", "Summary", "TechniqueSummary", "summarise"]
 
 NEAR_M, FAR_M = 2.0, 5.0
 PERCENTILES = (50, 75, 90)
-TECHNIQUES = ("ml", "ml_floor_known", "mlr", "abl", "posterior")
-
-
-@dataclass(frozen=True, slots=True)
-class Rate:
-    """A share of windows with its standard error; share None when there is no window to take it of."""
-
-    share: float | None
-    standard_error: float | None
-    windows: int
-
-    def __str__(self) -> str:
-        if self.share is None:
-            return "-"
-        error = "" if self.standard_error is None else f" ±{self.standard_error:.2f}".replace("0.", ".")
-        return f"{self.share:.2f}".replace("0.", ".", 1 if self.share < 1 else 0) + error
+TECHNIQUES = ("ml", "ml_floor_known", "mlr", "abl", "posterior", "strongest", "prior_disc")
+STATUSES = ("fix", "ambiguous", "inconsistent", "unmapped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +30,28 @@ class TechniqueSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class Reliability:
+    """Share of windows whose truth lies on the believed floor within the radius that is to hold a share of it.
+
+    held      per share of SHARES, in percent; `stated`: what they should be, the floor's probability counted in
+    windows   over which: not those called unmapped, whose radii are those of the whole floor
+    """
+
+    held: dict[str, Rate]
+    stated: dict[str, float]
+    windows: int
+
+
+@dataclass(frozen=True, slots=True)
 class Summary:
     """All windows of one length, or those over mapped ground.
 
     right_floor          the posterior's strongest floor is the right one
     status               share of windows by status
-    radius_68, radius_95 share of windows whose true place lies on the believed floor within the stated radius
     fix_within_5_m       of the windows answered with status "fix", those on the right floor within 5 m
+    acceptance           what could be accepted by the strongest mode's probability, right within 5 m; `disc_acceptance`
+                         the same of those that were told a prior position
+    reliability          of the posterior's radii; `disc_reliability`: with a prior position, on the right floor
     """
 
     length_m: float
@@ -57,23 +61,13 @@ class Summary:
     right_floor: Rate
     techniques: dict[str, TechniqueSummary]
     status: dict[str, Rate]
-    radius_68: Rate
-    radius_95: Rate
+    disc_status: dict[str, Rate]
     fix_within_5_m: Rate
-
-
-def rate(values: Sequence[bool], walks: Sequence[str]) -> Rate:
-    """Share of true values; the standard error counts walks, not windows, as independent (linearised, n / (n - 1))."""
-    if not values:
-        return Rate(None, None, 0)
-    share = float(np.mean(values))
-    _, group = np.unique(np.asarray(walks), return_inverse=True)
-    sums = np.bincount(group, weights=np.asarray(values, dtype=np.float64) - share)
-    count = len(sums)
-    if count < 2:
-        return Rate(share, None, len(values))
-    variance = count / (count - 1) * float(np.sum(np.square(sums))) / len(values) ** 2
-    return Rate(share, float(np.sqrt(variance)), len(values))
+    disc_fix_within_5_m: Rate
+    acceptance: Acceptance
+    disc_acceptance: Acceptance
+    reliability: Reliability
+    disc_reliability: Reliability
 
 
 def summarise(evaluation: Evaluation) -> list[Summary]:
@@ -88,25 +82,62 @@ def summarise(evaluation: Evaluation) -> list[Summary]:
 
 
 def _summary(windows: Sequence[JudgedWindow], covered_only: bool) -> Summary:
-    def share(judge: Callable[[JudgedWindow], bool], among: Sequence[JudgedWindow] = windows) -> Rate:
-        return rate([judge(w) for w in among], [f"{w.floor_id}/{w.walk}" for w in among])
-
-    fixes = [w for w in windows if w.status == "fix"]
+    answers = [(w.answer, _walk(w)) for w in windows]
+    told = [(w.disc, _walk(w)) for w in windows if w.disc is not None]
     return Summary(
         length_m=windows[0].length_m,
         covered_only=covered_only,
         windows=len(windows),
-        walks=len({(w.floor_id, w.walk) for w in windows}),
-        right_floor=share(lambda w: w.posterior is not None and w.posterior.right_floor),
+        walks=len({_walk(w) for w in windows}),
+        right_floor=_share(answers, lambda answer: answer.position.right_floor),
         techniques={name: _technique(windows, name) for name in TECHNIQUES},
-        status={
-            name: share(lambda w, name=name: w.status == name)  # type: ignore[misc]
-            for name in ("fix", "ambiguous", "inconsistent", "unmapped")
-        },
-        radius_68=share(lambda w: w.posterior is not None and w.posterior.within(w.radius_68_m)),
-        radius_95=share(lambda w: w.posterior is not None and w.posterior.within(w.radius_95_m)),
-        fix_within_5_m=share(lambda w: w.posterior is not None and w.posterior.within(FAR_M), fixes),
+        status=_statuses(answers),
+        disc_status=_statuses(told),
+        fix_within_5_m=_fixes_within_5_m(answers),
+        disc_fix_within_5_m=_fixes_within_5_m(told),
+        acceptance=_acceptance(answers),
+        disc_acceptance=_acceptance(told),
+        reliability=_reliability(answers),
+        disc_reliability=_reliability(told),
     )
+
+
+def _walk(window: JudgedWindow) -> str:
+    return f"{window.floor_id}/{window.walk}"
+
+
+Answers = Sequence[tuple[Answer, str]]  # each with the walk its window is of
+
+
+def _share(answers: Answers, judge: Callable[[Answer], bool]) -> Rate:
+    return rate([judge(answer) for answer, _ in answers], [walk for _, walk in answers])
+
+
+def _statuses(answers: Answers) -> dict[str, Rate]:
+    return {name: _share(answers, lambda answer, name=name: answer.status == name) for name in STATUSES}  # type: ignore[misc]
+
+
+def _fixes_within_5_m(answers: Answers) -> Rate:
+    fixes = [(answer, walk) for answer, walk in answers if answer.status == "fix"]
+    return _share(fixes, lambda answer: answer.position.within(FAR_M))
+
+
+def _acceptance(answers: Answers) -> Acceptance:
+    return reachable_acceptance(
+        [answer.confidence for answer, _ in answers],
+        [answer.strongest.within(FAR_M) for answer, _ in answers],
+        [walk for _, walk in answers],
+    )
+
+
+def _reliability(answers: Answers) -> Reliability:
+    mapped = [(answer, walk) for answer, walk in answers if answer.status != "unmapped"]
+    floor = float(np.mean([answer.floor_probability for answer, _ in mapped])) if mapped else np.nan
+    held = {
+        f"{100 * share:.0f}": _share(mapped, lambda answer, k=k: answer.holds(k))  # type: ignore[misc]
+        for k, share in enumerate(SHARES)
+    }
+    return Reliability(held, {f"{100 * share:.0f}": share * floor for share in SHARES}, len(mapped))
 
 
 def _technique(windows: Sequence[JudgedWindow], name: str) -> TechniqueSummary:
@@ -114,14 +145,12 @@ def _technique(windows: Sequence[JudgedWindow], name: str) -> TechniqueSummary:
     for window in windows:
         place: Place | None = getattr(window, name)
         if place is not None:
-            answered.append((place, f"{window.floor_id}/{window.walk}"))
+            answered.append((place, _walk(window)))
     walks = [walk for _, walk in answered]
     error_m = [place.error_m if place.right_floor else np.inf for place, _ in answered]
     percentiles = np.percentile(error_m, PERCENTILES, method="higher") if error_m else np.full(len(PERCENTILES), np.nan)
     return TechniqueSummary(
-        available=rate(
-            [getattr(window, name) is not None for window in windows], [f"{w.floor_id}/{w.walk}" for w in windows]
-        ),
+        available=rate([getattr(window, name) is not None for window in windows], [_walk(w) for w in windows]),
         right_floor=rate([place.right_floor for place, _ in answered], walks),
         within_2_m=rate([place.within(NEAR_M) for place, _ in answered], walks),
         within_5_m=rate([place.within(FAR_M) for place, _ in answered], walks),

@@ -1,8 +1,11 @@
 """Hyper-parameters by surveys left out: walks whose labels err, and walks whose labels do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from app.field.error_structure import LABELS_SD_M, POSE_LEAVES_M, ErrorStructure, as_a_pose_leaves_it, labels_err
 from app.field.estimate import ambient_field_uT
 from app.field.fit import fit_map
 from app.field.hard_iron import HardIron
@@ -65,6 +68,17 @@ def test_choice_predicts_left_out_surveys_and_new_walks_better_where_labels_err(
     assert nlpd[0] < nlpd[1] + 0.02
 
 
+def test_a_likelihood_that_takes_the_field_for_errors_does_not_compete(vague):
+    """Of such a map nothing would count as measured, however well it predicts."""
+    observed, learned = vague
+    hyper = replace(learned.hyper, signal_sd_uT=0.2 * learned.hyper.signal_sd_uT, walk_ratio=20.0, bias_ratio=10.0)
+    chosen = choose_by_held_out_surveys(observed, replace(learned, hyper=hyper), SPEC, lambda *_: None)
+    was, now = hyper, chosen.hyper
+    assert now.bias_ratio + now.walk_ratio + now.white_ratio < 1.0
+    total = [np.square(h.signal_sd_uT) * (1 + h.bias_ratio + h.walk_ratio + h.white_ratio) for h in (was, now)]
+    np.testing.assert_allclose(total[1], total[0])
+
+
 def test_precise_walks_keep_the_most_likely():
     observed, learned = learned_from(straight_walks(np.random.default_rng(2), 0.0))
     assert choose_by_held_out_surveys(observed, learned, SPEC, lambda *_: None) is learned
@@ -105,3 +119,16 @@ def test_a_large_map_is_judged_by_some_of_its_squares():
     kept = np.concatenate([walk.position_m for walk in part])
     assert np.ptp(kept[:, 0]) > 900.0
     assert np.ptp(kept[:, 1]) > 900.0
+
+
+def test_errors_of_labels_are_short_for_a_pose():
+    """Where labels err, what a window's pose cannot take is short; where they do not, errors are what surveys show."""
+    vague, precise = (fit_map(straight_walks(np.random.default_rng(0), sd_m), SPEC).grid for sd_m in (1.5, 0.0))
+    assert labels_err(vague.noise_sd_uT, vague.prior_sd_uT)
+    assert vague.error_structure.walk_length_m <= POSE_LEAVES_M
+    assert vague.error_structure.position_sd_m == LABELS_SD_M
+    assert not labels_err(precise.noise_sd_uT, precise.prior_sd_uT)
+    assert not labels_err(np.full(3, 0.7), np.full(3, 1.0)), "a flat field: errors of any sensor are a large share"
+    long = ErrorStructure(0.1, 0.7, 0.2, 3.0)
+    assert precise.error_structure.position_sd_m == 0.0
+    assert as_a_pose_leaves_it(long) == replace(long, walk_length_m=POSE_LEAVES_M, position_sd_m=LABELS_SD_M)

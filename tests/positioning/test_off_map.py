@@ -90,6 +90,29 @@ def test_windows_from_another_building_are_no_fixes(
         assert "demeaned" in fix.reason
 
 
+def test_empty_cells_of_a_grid_do_not_make_the_hypothesis_likelier(grid_of: Callable, walk_on: Callable) -> None:
+    """A margin without samples around the same map: more poses, none of them on the map."""
+    world = smooth_world(grid_of, 7, (40, 40))
+    margin = ((0, 0), (60, 60), (60, 60), (0, 0))
+    x0, y0 = world.origin_m
+    ambient = np.where(np.pad(world.measured, margin[:3])[..., None], 0.0, world.ambient_uT).astype(np.float32)
+    padded = dataclasses.replace(
+        world,
+        origin_m=(x0 - 60 * world.resolution_m, y0 - 60 * world.resolution_m),
+        mean_uT=np.pad(world.mean_uT, margin) + ambient,
+        sd_uT=np.pad(world.sd_uT, margin),
+        gradient_uT_per_m=np.pad(world.gradient_uT_per_m, (*margin, (0, 0))),
+        measured=np.pad(world.measured, margin[:3]),
+    )
+    rng = np.random.default_rng(8)
+    for _ in range(3):
+        window = walk_on(rng, world, length_m=2.0).window
+        alone, within = (locate(window, [prepare_floor("a", grid)]).posterior for grid in (world, padded))
+        assert alone is not None
+        assert within is not None
+        assert within.off_map_probability == pytest.approx(alone.off_map_probability, rel=0.1)
+
+
 def test_the_refined_position_stays_on_the_grid(grid_of: Callable, walk_on: Callable) -> None:
     world = smooth_world(grid_of, 7, (24, 24))
     x0, y0, _, x1, y1, _ = world.bounds_m
@@ -139,3 +162,17 @@ def test_a_field_that_is_nowhere_here_overflows_nothing(grid_of: Callable, walk_
         assert fix.status in ("unmapped", "inconsistent")
         assert fix.posterior is not None
         assert fix.posterior.off_map_probability > 0.99
+
+
+def test_radii_hold_what_labels_of_the_map_err_by(grid_of: Callable, walk_on: Callable) -> None:
+    """Two metres per axis: 68 % of a Gaussian in the plane lie within 1.51 sds, 95 % within 2.45."""
+    world = smooth_world(grid_of, 2)
+    vague = dataclasses.replace(world, error_structure=dataclasses.replace(world.error_structure, position_sd_m=2.0))
+    window = walk_on(np.random.default_rng(4), world, length_m=8.0, samples=33).window
+    sure, unsure = (locate(window, [prepare_floor("a", grid)]).posterior for grid in (world, vague))
+    assert sure is not None
+    assert unsure is not None
+    assert sure.radius_95_m < 0.5
+    assert unsure.radius_68_m == pytest.approx(1.51 * 2.0, rel=0.1)
+    assert unsure.radius_95_m == pytest.approx(2.45 * 2.0, rel=0.1)
+    np.testing.assert_allclose(unsure.position_m, sure.position_m, atol=0.3)

@@ -13,18 +13,13 @@ from app.cli import evaluate as command
 from app.errors import InvalidInput
 from app.field.samples import Samples
 from app.field.session_bias import estimate_session_biases
+from app.services.acceptance import reachable_acceptance
 from app.services.cross_validate_maps import cross_validate_maps
-from app.services.evaluate_walks import (
-    Evaluation,
-    EvaluationPlan,
-    JudgedWindow,
-    Place,
-    calibrate_sessions,
-    cut_windows,
-    evaluate_walks,
-    hold_out,
-)
-from app.services.evaluation_summary import rate, summarise
+from app.services.evaluate_walks import Evaluation, EvaluationPlan, evaluate_walks
+from app.services.evaluation_summary import summarise
+from app.services.held_out_walks import calibrate_sessions, hold_out
+from app.services.judge_windows import Answer, JudgedWindow, Place, cut_windows, disc_centre_m
+from app.services.rates import rate
 from app.survey.walk import DeadReckoning, Walk
 
 STEP_S, STEP_M = 0.56, 0.64
@@ -106,7 +101,9 @@ def test_a_known_building_is_evaluated_end_to_end(building, tmp_path):
         "robust sd",
         "gain",
         "right floor",
-        "truth in 95 % radius",
+        "Truth within the radii",
+        "prior disc",
+        "reachable",
         "broken.txt",
         "cut.txt.gz",
     ):
@@ -255,21 +252,22 @@ def test_standard_errors_count_walks_not_windows():
     ]  # fmt: skip
 
 
-def judged(walk, right, error_m, covered=True, status="fix", answers=True):
+def judged(walk, right, error_m, covered=True, status="fix", answers=True, confidence=0.5):
     place = Place(right, error_m)
-    return JudgedWindow(
-        "F", walk, 20.0, covered, status, place, place, place if answers else None, None, place, 0.5, 2.0, 9.0
-    )
+    answer = Answer(status, place, place, confidence, 0.8, 0.1, (1.0, 2.0, 6.0, 9.0))
+    return JudgedWindow("F", walk, 20.0, covered, place, place, place if answers else None, None, answer, answer)
+
+
+WINDOWS = (
+    judged("a", True, 1.0, confidence=0.9),
+    judged("a", True, 4.0, answers=False),
+    judged("b", False, 0.5, status="ambiguous"),
+    judged("c", True, 30.0, covered=False, status="unmapped"),
+)
 
 
 def test_summaries_count_a_wrong_floor_as_infinitely_wrong():
-    windows = (
-        judged("a", True, 1.0),
-        judged("a", True, 4.0, answers=False),
-        judged("b", False, 0.5, status="ambiguous"),
-        judged("c", True, 30.0, covered=False),
-    )
-    everything, covered = summarise(Evaluation((), windows, {}))
+    everything, covered = summarise(Evaluation((), WINDOWS, {}))
     assert (everything.windows, everything.walks, covered.windows) == (4, 3, 3)
     assert everything.techniques["ml"].within_2_m.share == 0.25
     assert everything.techniques["ml"].within_5_m.share == 0.5
@@ -277,7 +275,54 @@ def test_summaries_count_a_wrong_floor_as_infinitely_wrong():
     assert everything.techniques["mlr"].available.share == 0.75
     assert everything.techniques["abl"].available.share == 0.0
     assert everything.techniques["abl"].right_floor.share is None
+    assert everything.techniques["prior_disc"].within_5_m.share == 0.5
     assert everything.right_floor.share == 0.75
-    assert (everything.radius_68.share, everything.radius_95.share) == (0.25, 0.5)
     assert covered.fix_within_5_m.share == 1.0
     assert covered.status["ambiguous"].share == pytest.approx(1 / 3)
+
+
+def test_reliability_is_of_windows_that_are_not_called_unmapped():
+    everything, _ = summarise(Evaluation((), WINDOWS, {}))
+    found = everything.reliability
+    assert found.windows == 3
+    assert {share: held.share for share, held in found.held.items()} == {
+        "50": pytest.approx(1 / 3), "68": pytest.approx(1 / 3), "90": pytest.approx(2 / 3), "95": pytest.approx(2 / 3)
+    }  # fmt: skip
+    assert found.stated["95"] == pytest.approx(0.95 * 0.8)
+
+
+def test_acceptance_is_the_most_that_can_be_taken_with_nine_in_ten_right():
+    confidence = [0.9] * 9 + [0.8] + [0.7, 0.6]
+    right = [True] * 9 + [False] + [False, True]
+    walks = [str(k) for k in range(12)]
+    found = reachable_acceptance(confidence, right, walks)
+    assert found.accepted.share == pytest.approx(10 / 12)
+    assert found.right.share == pytest.approx(0.9)
+    assert found.least_confidence == 0.8
+    # Equally sure windows come together: one of two that are right does not do.
+    none = reachable_acceptance([0.5, 0.5], [True, False], ["a", "b"])
+    assert none.accepted.share == 0.0
+    assert none.right.share is None
+    assert none.least_confidence is None
+    assert reachable_acceptance([], [], []).accepted.share is None
+
+
+def test_prior_positions_are_spread_evenly_over_their_disc():
+    truth_m = np.array([3.0, -2.0])
+    drawn = np.array([disc_centre_m(truth_m, 20.0, str(k)) for k in range(2000)]) - truth_m
+    assert np.linalg.norm(drawn, axis=1).max() < 20.0
+    assert drawn.std(axis=0) == pytest.approx([10.0, 10.0], rel=0.05)
+    np.testing.assert_array_equal(disc_centre_m(truth_m, 20.0, "7"), truth_m + drawn[7])
+
+
+def test_every_walk_is_asked_once_where_all_folds_are_held_out(building, tmp_path):
+    report = tmp_path / "report.json"
+    asked = [str(building), "--folds", "--length", "10", "--processes", "1", "--json", str(report)]
+    result = CliRunner().invoke(_application(), asked)
+    assert result.exit_code == 0, result.output
+    assert "each survey left out" not in result.output
+    document = json.loads(report.read_text())
+    windows = document["evaluation"]["windows"]
+    assert {w["walk"] for w in windows} == {f"walk-{k}" for k in range(6)}
+    assert document["evaluation"]["floors"] == []
+    assert np.mean([w["disc"]["position"]["error_m"] < 3.0 for w in windows]) > 0.8

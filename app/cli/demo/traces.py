@@ -12,7 +12,8 @@ from app.cli.demo.world import DemoFloor, Question, SurveyFile, Told, World, bod
 from app.errors import InvalidInput, UnreadableSurvey
 from app.geometry import Array
 from app.positioning.window import Window
-from app.services.evaluate_walks import COVERED_SHARE, COVERED_WITHIN_M, cut_windows, hold_out
+from app.services.held_out_walks import hold_out
+from app.services.judge_windows import COVERED_SHARE, COVERED_WITHIN_M, cut_windows
 from app.survey.read import read_survey
 from app.survey.walk import Walk
 
