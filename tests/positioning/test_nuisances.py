@@ -1,4 +1,4 @@
-"""What a window does not tell by itself: the sensor's offset, the step's scale, the heading's drift; and how far to walk."""
+"""What a window does not tell by itself: the sensor's offset, step scale and heading drift; and how far to walk."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,10 +26,11 @@ def test_an_offset_of_a_device_that_turns_is_integrated_out(world: FieldGrid) ->
     """A right angle walked with ten microtesla of hard iron: constant in the body, not in the building."""
     rng = np.random.default_rng(2)
     leg = np.arange(0.0, 4.01, 0.25)
-    p = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([4.0 + 0 * leg[1:], leg[1:]])]) + [4.0, 12.0]
+    p = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([4.0 + 0 * leg[1:], leg[1:]])])
+    p = p + np.array([4.0, 12.0])
     yaw = np.concatenate([np.zeros(len(leg)), np.full(len(leg) - 1, np.pi / 2)])
     truth = world.at(p).mean_uT
-    body = np.array([yaw_matrix(-a) @ B for a, B in zip(yaw, truth, strict=True)]) + [8.0, -5.0, 4.0]
+    body = np.array([yaw_matrix(-a) @ B for a, B in zip(yaw, truth, strict=True)]) + np.array([8.0, -5.0, 4.0])
     B = np.array([yaw_matrix(a) @ b for a, b in zip(yaw, body, strict=True)]) + rng.normal(0.0, 0.4, truth.shape)
     level = Window("level", B, np.column_stack([p - p[0], np.zeros(len(p))]), 0.4, yaw_rad=yaw)
     rotations = np.array([yaw_matrix(a) for a in yaw])
