@@ -18,8 +18,8 @@ __all__ = [
     "mixture_points", "replace_narrow_modes", "untold_variance_m2",
 ]  # fmt: skip
 
-POSITION_SD_FLOOR_M = 0.015  # of the map's coordinates; with the next, what calibrates on analytic buildings
-DISPLACEMENT_SD_M = 0.015  # random walk of a window's displacements, per root of a metre
+POSITION_SD_FLOOR_M = 0.01  # of the map's coordinates; with the next, what calibrates on analytic buildings
+DISPLACEMENT_SD_M = 0.024  # random walk of a window's displacements, per root of a metre
 _LEFT_AT_THE_END = 2.0 / 15.0  # of a random walk's variance, when its mean and trend are fitted out
 _RINGS, _SPOKES = 24, 12
 _MANY = 4000

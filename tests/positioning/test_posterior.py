@@ -71,7 +71,7 @@ def test_what_a_fit_leaves_of_a_random_walk_at_its_end() -> None:
     """Place, trend (heading and scale) fitted out of a random walk: the variance left at its end, by simulation."""
     rng, n, length_m = np.random.default_rng(0), 400, 20.0
     path = np.linspace(0.0, length_m, n)
-    walks = np.cumsum(rng.normal(0.0, 0.015 * np.sqrt(length_m / n), (4000, n)), axis=1)
+    walks = np.cumsum(rng.normal(0.0, 0.024 * np.sqrt(length_m / n), (4000, n)), axis=1)
     design = np.column_stack([np.ones(n), path])
     left = walks - walks @ design @ np.linalg.solve(design.T @ design, design.T)
     assert untold_variance_m2(path) - untold_variance_m2(path[:1]) == pytest.approx(left[:, -1].var(), rel=0.1)
