@@ -133,7 +133,7 @@ class Mode:
 class Posterior:
     """The belief. `radius_*_m` are horizontal radii about `position_m` holding that share of the mass on that floor,
     position and covariance those of the strongest floor: the mean of its strongest mode, and the second moment of its
-    mass about it. When less than half of the probability is on maps, or much of it was not weighed, radii and
+    mass about it. When less than 0.4 of the probability is on maps, or much of it was not weighed, radii and
     covariance are those of the whole searched area. `off_map_probability`: that less than half of the window was walked
     where something is mapped.
     `missed_probability`: at most this much mass lies in poses the search left out.

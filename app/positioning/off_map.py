@@ -24,7 +24,7 @@ from app.positioning.matching import Matched, prior_mass
 
 __all__ = ["Evidence", "OffMap", "ProcessPrior", "off_map", "process_evidence", "process_prior"]
 
-OFF_MAP_PRIOR = 0.4  # how likely, before the window is looked at, it was walked where nothing is mapped
+OFF_MAP_PRIOR = 0.5  # how likely, before the window is looked at, it was walked where nothing is mapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,8 @@ from app.positioning.techniques import chi_square_limit
 
 __all__ = ["conclude"]
 
-_CERTAIN = 0.8  # a fix has one mode with at least this probability, off the map and what was missed counted in
+_CERTAIN = 0.9  # a fix has one mode with at least this probability, off the map and what was missed counted in
+_OFF = 0.6  # from this probability on a window is unmapped: beforehand it is a half, and that is no finding
 _MISSED = 0.05  # beyond this share of missed mass a radius of 95 % cannot be stated from the rest
 
 
@@ -70,7 +71,7 @@ def _posterior(matched: Matched, belief: Belief) -> Posterior:
     off = points - centre
     covariance = np.asarray((mass * off.T) @ off / mass.sum())
     if (
-        belief.unmapped > 0.5 or _unweighed(matched, belief) > _MISSED
+        belief.unmapped > _OFF or _unweighed(matched, belief) > _MISSED
     ):  # what was weighed says little of where the window may be
         radii = (_searched_radius_m(matched, strongest, centre),) * 4
         covariance = _searched_covariance_m2(matched, strongest, centre)
@@ -101,7 +102,7 @@ def _status(matched: Matched, belief: Belief, options: LocateOptions) -> tuple[S
     distance2 = belief.best.distance2
     limit = chi_square_limit(scalars, options.gate_probability)
     unlike_any_field = belief.off_map_distance2 > chi_square_limit(belief.off_map_scalars, options.gate_probability)
-    if belief.unmapped > 0.5 and not (unlike_any_field and distance2 > limit):
+    if belief.unmapped > _OFF and not (unlike_any_field and distance2 > limit):
         weighed = "not all of the map was weighed, but " if _unweighed(matched, belief) > 0.5 else ""
         return "unmapped", (
             f"{weighed}the window fits ground without a map at least as well (probability {belief.unmapped:.2f}); walk "

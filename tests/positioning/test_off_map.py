@@ -66,7 +66,7 @@ def test_length_scale_is_that_of_the_field(grid_of: Callable) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "length_m", "composition"), [("level", 5.0, "raw"), ("level", 6.0, "demeaned"), ("norm", 12.0, "raw")]
+    ("frame", "length_m", "composition"), [("level", 5.0, "raw"), ("level", 6.0, "demeaned"), ("norm", 16.0, "raw")]
 )
 def test_windows_from_another_building_are_no_fixes(
     frame: str, length_m: float, composition: str, grid_of: Callable, walk_on: Callable
