@@ -78,7 +78,7 @@ class SearchableFloor:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held, the grid's included: about 150 per cell with three components."""
+        """Bytes held, the grid's included: about 190 per cell with three components."""
         return self.grid.nbytes + sum(plane.nbytes for plane in self.planes)
 
 
