@@ -50,7 +50,7 @@ def test_confidence_is_second_best_elsewhere_over_best(residual, apart_m):
     if not rivals:
         assert choice.ratio == np.inf
     elif choice.mad_uT > 0.0:
-        assert choice.ratio == pytest.approx(min(rivals) / choice.mad_uT)
+        assert choice.ratio == pytest.approx(float(min(rivals)) / choice.mad_uT)
 
 
 def test_parallel_track_of_the_truth_wins():
