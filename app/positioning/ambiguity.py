@@ -43,7 +43,7 @@ def walk_further(matched: Matched, belief: Belief) -> Further | None:
         return None
     ahead = np.arange(_STEP_M, FARTHEST_M + 1e-9, _STEP_M)
     seen, variance = _continued(matched, strongest, ahead)
-    enough = np.zeros(len(ahead), dtype=np.bool_) | True
+    enough = np.ones(len(ahead), dtype=np.bool_)
     per_step = matched.error.inflation
     for rival in rivals:
         other, of_other = _continued(matched, rival, ahead)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.field.error_structure import strictest
 from app.geometry import Array
 from app.positioning.matching import Matched
 from app.positioning.off_map import off_map
@@ -72,8 +71,7 @@ def believe(matched: Matched) -> Belief:
     peak = max(optima[0].objective, float(matched.score[0]))
     relative = np.exp(matched.score - peak)
     cell = np.array([plane.resolution_m for plane in matched.planes])
-    of_labels = strictest([floor.grid.error_structure for floor in matched.floors]).position_sd_m
-    untold = untold_variance_m2(matched.window.path_m) + of_labels**2
+    untold = untold_variance_m2(matched.window.path_m) + matched.structure.position_sd_m**2
     atoms = cell_atoms(found.plane, found.row, found.column, matched.position_m, relative, cell[found.plane], untold)
     atoms = replace_narrow_modes(atoms, [
         NarrowMode(each.plane, each.fine.pose[0, :2], each.fine.covariance[0, :2, :2],

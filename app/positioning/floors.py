@@ -35,7 +35,8 @@ class Plane:
     scale                  (c,) factor of each component: the horizontal ones keep their microteslas, the vertical is
                            stretched to their noise
     ambient_uT, off_map_variance_uT2   (c,) and a number: the same where there is no map
-    typical_variance_uT2   median variance over the measured cells
+    typical_variance_uT2   median variance over the measured cells, without what the field varies within them
+    searched_variance_uT2  median of variance_uT2
     gradient_uT_per_m      rms gradient of the features over the measured cells, components and axes together
     """
 
@@ -49,6 +50,7 @@ class Plane:
     ambient_uT: Array
     off_map_variance_uT2: float
     typical_variance_uT2: float
+    searched_variance_uT2: float
     gradient_uT_per_m: float
     pyramid: Pyramid
 
@@ -148,6 +150,7 @@ def _plane(grid: FieldGrid, layer: int, components: Components, noise_sd_uT: Arr
         ambient_uT=ambient,
         off_map_variance_uT2=off_map,
         typical_variance_uT2=float(np.median(known)) if len(known) else off_map,
+        searched_variance_uT2=float(np.median(spread)),
         gradient_uT_per_m=_rms_gradient(cells, measured, grid.resolution_m),
         pyramid=build_pyramid(features, spread, TOP_LEVEL),
     )

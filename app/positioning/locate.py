@@ -10,12 +10,12 @@ import numpy as np
 
 from app.errors import Fault, InvalidInput, InvalidWindow
 from app.field.grid import FieldGrid
-from app.positioning.belief import Belief, believe
+from app.positioning.belief import believe
 from app.positioning.explanation import Explanation, explain
 from app.positioning.features import common_components
 from app.positioning.fix import AblEstimate, ContourEstimate, Fix, LocateOptions, MadEstimate, MlrEstimate, Prior
 from app.positioning.floors import SearchableFloor, prepare_floor, prepare_floors, reduce_floor, shared_noise_sd_uT
-from app.positioning.matching import Matched, match
+from app.positioning.matching import match
 from app.positioning.verdict import conclude
 from app.positioning.window import Composition, Window
 
@@ -49,7 +49,9 @@ def locate(
     so at once, otherwise they are prepared again here.
     Raises InvalidWindow, IncompatibleFrames (a map cannot answer this frame), InvalidInput (prior or options).
     """
-    return _answer(window, floors, composition, techniques, prior, options or LocateOptions())[0]
+    return locate_and_explain(
+        window, floors, composition=composition, techniques=techniques, prior=prior, options=options, explained=False
+    )[0]
 
 
 def locate_and_explain(
@@ -60,20 +62,10 @@ def locate_and_explain(
     techniques: Sequence[str] = TECHNIQUES,
     prior: Prior | None = None,
     options: LocateOptions | None = None,
+    explained: bool = True,
 ) -> tuple[Fix, Explanation | None]:
-    """`locate`, and why: None only where no floor had a map to search."""
-    fix, known = _answer(window, floors, composition, techniques, prior, options or LocateOptions())
-    return fix, explain(*known) if known else None
-
-
-def _answer(
-    window: Window,
-    floors: Sequence[SearchableFloor],
-    composition: Composition,
-    techniques: Sequence[str],
-    prior: Prior | None,
-    options: LocateOptions,
-) -> tuple[Fix, tuple[Matched, Belief] | None]:
+    """`locate`, and why: None where it is not to be explained, or no floor had a map to search."""
+    options = options or LocateOptions()
     _check_window(window, composition)
     _check_options(prior, options)
     if not floors:
@@ -87,7 +79,7 @@ def _answer(
     ready = [reduce_floor(floor, shared, noise_sd_uT) for floor in floors]
     matched = match(window, ready, shared, composition, prior, options)
     belief = believe(matched)
-    return conclude(matched, belief, techniques, options), (matched, belief)
+    return conclude(matched, belief, techniques, options), explain(matched, belief) if explained else None
 
 
 def warm_up() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Fault, InvalidInput
-from app.field.error_structure import strictest
+from app.field.error_structure import ErrorStructure, strictest
 from app.field.samples import Components
 from app.geometry import Array, wrap_angle_rad
 from app.positioning.feature_matching import feature_candidates, find_feature, with_aligned
@@ -41,6 +41,7 @@ class Matched:
 
     floors, planes     planes[k] belongs to floors[plane_floor[k]]
     window, error      as it was matched; `turned[k]` the window on planes[k]
+    structure          of the errors of the floors' maps, the strictest of theirs
     courses            of the lattice; `device_turn_rad` is added for the device's heading at the last sample (None: a
                        building window has no heading to tell)
     candidates         poses of the lattice; position_m (n, 2) of the last sample
@@ -49,7 +50,6 @@ class Matched:
     best               the candidate that answers for maximum likelihood: the first; of a feature the first whose peak
                        lies on one of the map's
     pose_prior         of the position
-    prior_mass         of the lattice under the priors, each pose weighing exp(log prior)
     """
 
     floors: tuple[SearchableFloor, ...]
@@ -58,6 +58,7 @@ class Matched:
     window: ReducedWindow
     turned: tuple[Turned, ...]
     error: WindowError
+    structure: ErrorStructure
     courses: Courses
     asked: Window
     composition: Composition
@@ -69,7 +70,6 @@ class Matched:
     distance2: Array
     best: int
     pose_prior: PosePrior
-    prior_mass: float
 
     def floor_id(self, plane: int) -> str:
         return self.floors[int(self.plane_floor[plane])].floor_id
@@ -106,7 +106,7 @@ def match(
         feature = find_feature(reduced, float(np.sqrt(typical)))
         reduced = feature.section
     error = window_error(reduced.path_m, reduced.noise_variance_uT2, typical, structure, bias_sd_uT)
-    searched = float(np.min([np.median(plane.variance_uT2) for plane in planes]))
+    searched = min(plane.searched_variance_uT2 for plane in planes)
     variance = error.inflation * (error.own_share * searched + reduced.noise_variance_uT2)
     steepest = max(plane.gradient_uT_per_m for plane in planes)
     steps = widest_steps(reduced, steepest, variance, error.offset_precision)
@@ -122,11 +122,10 @@ def match(
     if feature is not None:
         found, aligned = with_aligned(found, feature_candidates(feature, planes, courses))
     found, aligned = _kept_to(found, aligned, pose_prior)
-    turned = tuple(turn_window(reduced, courses, plane.resolution_m) for plane in planes)
+    by_resolution = {cell_m: turn_window(reduced, courses, cell_m) for cell_m in {p.resolution_m for p in planes}}
+    turned = tuple(by_resolution[plane.resolution_m] for plane in planes)
     if composition == "differenced":
-        error = replace(
-            error, whiten=differenced(len(reduced)) @ np.eye(len(reduced)), log_det=0.0, offset_precision=None
-        )
+        error = replace(error, whiten=differenced(len(reduced)), log_det=0.0, offset_precision=None)
     score, distance2 = _scored(planes, on_lattice, turned, found, error)
     position = _positions(planes, found)
     score = score + _log_prior(planes, found, courses, position, pose_prior)
@@ -139,6 +138,7 @@ def match(
         window=reduced,
         turned=turned,
         error=error,
+        structure=structure,
         courses=courses,
         asked=window,
         composition=composition,
@@ -150,7 +150,6 @@ def match(
         distance2=distance2[order],
         best=int(np.argmax(aligned)),
         pose_prior=pose_prior,
-        prior_mass=prior_mass(planes, pose_prior, courses),
     )
 
 

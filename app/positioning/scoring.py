@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from app.geometry import Array
 from app.positioning.floors import Plane
 from app.positioning.lattice import ReducedWindow, Turned
-from app.positioning.window_error import Fit, WindowError, weigh_residuals
+from app.positioning.window_error import Fit, WindowError
 
 __all__ = ["pose_residuals", "score_poses", "sensor_residual"]
 
@@ -55,11 +55,6 @@ def sensor_residual(residual: Array, turn: Array, tilt: Array) -> Array:
     x, y, z = residual[..., 0], residual[..., 1], residual[..., 2]
     upright = np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
     return np.einsum("nab,...nb->...na", tilt, upright) if len(tilt) else upright
-
-
-def fit_residuals(residual: Array, variance_uT2: Array, window: ReducedWindow, error: WindowError) -> Fit:
-    """`weigh_residuals` with the map's variances (..., n) made the window's."""
-    return weigh_residuals(residual, error.own_share * variance_uT2 + window.noise_variance_uT2, error)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -31,14 +31,13 @@ CAPACITY = 400_000  # poses kept at most
 BUDGET = 4_000_000_000  # values compared per plane at most: poses or nodes, times samples, times components
 _TOP_SHARE = 0.25  # of the budget, for the nodes the search starts from
 _MOST_NODES = 800_000  # of a level that may be followed on a plane
-_TOP, _OFFSET_TOP = 4, 4  # levels to start from: what larger blocks hold is hardly ever excluded
+_TOP = 4  # the level to start from: what larger blocks hold is hardly ever excluded
 _SHARE = 1.0  # of a block's side, by which a group of courses may spread the samples
 _BEAM = 16
 _WIDE = 300
 _DIVE_AGAIN = 1500  # nodes of one level: so many mean the incumbent is poor
 _NEGLIGIBLE_NATS = 60.0
 _CHUNK = 4_000  # nodes split between two looks at the caller's patience
-_ENDLESS = 1 << 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,15 +190,15 @@ def _on_planes(
                 _SHARE, scene.headed,
             )  # fmt: skip
         tree = trees[plane.resolution_m]
-        on_planes.append(_OnPlane(scene, tree, window.features_uT.shape[1], _top(plane, window, tree, error, budget)))
+        on_planes.append(_OnPlane(scene, tree, window.features_uT.shape[1], _top(plane, window, tree, budget)))
         expected = max(expected, usual)
     return on_planes, expected
 
 
-def _top(plane: Plane, window: ReducedWindow, tree: CourseTree, error: WindowError, budget: int) -> int:
+def _top(plane: Plane, window: ReducedWindow, tree: CourseTree, budget: int) -> int:
     """The level to start from: larger blocks where the budget does not allow more."""
     ny, nx = plane.shape
-    level = min(_TOP if error.offset_precision is None else _OFFSET_TOP, len(tree.stages) - 1)
+    level = min(_TOP, len(tree.stages) - 1)
     while level < len(tree.stages) - 1:
         stage = tree.stages[level]
         blocks = ((ny >> level) + 2) * ((nx >> level) + 2)

@@ -11,7 +11,7 @@ from app.db.tables import Floor, Map
 from app.errors import NotFound
 from app.positioning.explanation import Explanation
 from app.positioning.fix import Fix, LocateOptions, Prior
-from app.positioning.locate import locate, locate_and_explain
+from app.positioning.locate import locate_and_explain
 from app.positioning.window import Composition, Window
 from app.services.grid_cache import GridCache
 
@@ -84,8 +84,9 @@ def locate_window(
     """Match a window against maps. Raises InvalidWindow, IncompatibleFrames."""
     floors = cache.searchable([(each.floor_id, each.grid_sha256) for each in maps])
     start = perf_counter()
-    answer = locate_and_explain if explained else locate
-    found = answer(window, floors, composition=composition, techniques=techniques, prior=prior, options=options)
-    fix, explanation = found if isinstance(found, tuple) else (found, None)
+    fix, explanation = locate_and_explain(
+        window, floors, composition=composition, techniques=techniques, prior=prior, options=options,
+        explained=explained,
+    )  # fmt: skip
     search_ms = 1e3 * (perf_counter() - start)
     return LocateResult(fix, tuple(each.map_id for each in maps), search_ms, explanation)
