@@ -13,7 +13,7 @@ from fastapi.responses import RedirectResponse
 from threadpoolctl import threadpool_limits
 
 from app import __version__
-from app.api import buildings, health, jobs, localizability, locate, maps, surveys
+from app.api import buildings, health, jobs, localizability, locate, maps, replay, surveys
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.metrics import Metrics, MetricsMiddleware
@@ -84,15 +84,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         context.engine.dispose()
 
     context = open_context(settings)
-    viewer = ViewerApp(context.keys.recognise, DatabaseViewerSource(context.sessions, context.blobs))
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
-    for part in (locate, health, buildings, surveys, maps, localizability, jobs):
+    for part in (locate, health, buildings, surveys, maps, localizability, replay, jobs):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)
+    viewer = ViewerApp(context.keys.recognise, DatabaseViewerSource(context.sessions, context.blobs), api=app)
     app.mount("/view", viewer)
     add_problem_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, streams_itself=_is_upload)
@@ -117,7 +117,8 @@ def _to_the_page() -> RedirectResponse:
 
 
 def _is_upload(path: str) -> bool:
-    return path.startswith("/v1/floors/") and path.endswith("/surveys")
+    """Whether an upload comes here, straight or by the page."""
+    return path.removeprefix("/view").startswith("/v1/floors/") and path.endswith(("/surveys", "/replay"))
 
 
 def _describe_problems(app: FastAPI) -> None:

@@ -384,7 +384,7 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
 
     def page() -> bytes:
         samples = [samples_from_bytes(context.blobs.get(survey.samples_sha256)) for survey in surveys]
-        walks = [Walk(s.id, s.name, w.p_building_m, w.B_uT) for s, w in zip(surveys, samples, strict=True)]
+        walks = [Walk(s.id, s.name, w) for s, w in zip(surveys, samples, strict=True)]
         rings, title = rings_of_polygon(floor.outline), f"{floor.name}: magnetic map"
         return static_view_html(grid, walks, title, rings, floor.elevation_m).encode()
 

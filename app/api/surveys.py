@@ -26,12 +26,12 @@ from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
 from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
 
-__all__ = ["SurveyView", "router"]
+__all__ = ["SURVEY_FILES", "SurveyFormat", "SurveyView", "router"]
 
 router = APIRouter(prefix="/v1", tags=["surveys"], responses=ERROR_RESPONSES)
 SurveyFormat = Literal["csv", "parquet", "ndjson", "indoor-location-2020"]
 
-_FILES: dict[str, Any] = {
+SURVEY_FILES: dict[str, Any] = {
     "required": True,
     "content": {
         "text/csv": {
@@ -120,7 +120,7 @@ def _lock_survey(session: Session, identity: Identity, survey_id: str) -> Survey
     status_code=202,
     response_model=ReceivedSurvey,
     responses={200: {"model": ReceivedSurvey, "description": "The same bytes, or equal samples, were uploaded before"}},
-    openapi_extra={"requestBody": _FILES},
+    openapi_extra={"requestBody": SURVEY_FILES},
     summary="Upload a survey",
 )
 async def upload_survey(

@@ -122,13 +122,15 @@ class Floors:
         return cls(prepare_floors(grids), {floor_id: prepare_floor(floor_id, grid) for floor_id, grid in grids.items()})
 
 
-def cut_windows(reckoned: DeadReckoning, length_m: float) -> Iterator[tuple[slice, Window]]:
-    """Windows of a length walked, each half a length after the last, as the phone would send them at their end.
+def cut_windows(
+    reckoned: DeadReckoning, length_m: float, every_m: float | None = None
+) -> Iterator[tuple[slice, Window]]:
+    """Windows of a length walked, one `every_m` (None: half a length), as the phone would send them at their end.
 
     The heading is what the phone believed at the window's last sample, carried back to its first.
     """
     path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reckoned.displacement_m, axis=0), axis=1))])
-    for start_m in np.arange(0.0, path_m[-1] - length_m, 0.5 * length_m):
+    for start_m in np.arange(0.0, path_m[-1] - length_m, 0.5 * length_m if every_m is None else every_m):
         first, last = np.searchsorted(path_m, [start_m, start_m + length_m])
         part = slice(int(first), int(last) + 1)
         turned_rad = reckoned.yaw_rad[part] - reckoned.yaw_rad[first]

@@ -2,48 +2,120 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
-from app.field.grid import FieldGrid
-from app.viewer.source import ViewedBuilding, ViewerSource, Walk
+from app.geometry import Array
+from app.viewer.layers import difference_uT, layer_values
+from app.viewer.source import ViewedBuilding, ViewedMap, ViewerSource, Walk
 
-__all__ = ["GridCache", "OrganisationContent"]
+__all__ = ["OrganisationContent", "RecentlyUsed"]
 
 
-class GridCache:
-    """The grids shown lately, up to `max_bytes` in all. Maps never change, so nothing here grows stale."""
+class Weighed(Protocol):
+    @property
+    def nbytes(self) -> int: ...
+
+
+Value = TypeVar("Value", bound=Weighed)
+
+
+class RecentlyUsed:
+    """What was used lately, up to `max_bytes` in all: maps, their layers, walks. Nothing here grows stale: maps never
+    change, nor do surveys."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
-        self._grids: OrderedDict[tuple[str, str], FieldGrid] = OrderedDict()
+        self._held: OrderedDict[Hashable, Weighed] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, source: ViewerSource, organisation_id: str, map_id: str) -> FieldGrid:
-        key = (organisation_id, map_id)
+    def get(self, key: Hashable, kind: type[Value], make: Callable[[], Value]) -> Value:
+        """The value under a key, made when it is not there."""
         with self._lock:
-            if key in self._grids:
-                self._grids.move_to_end(key)
-                return self._grids[key]
-        grid = source.grid(organisation_id, map_id)
+            held = self._held.get(key)
+            if isinstance(held, kind):
+                self._held.move_to_end(key)
+                return held
+        value = make()
+        self.put(key, value)
+        return value
+
+    def peek(self, key: Hashable, kind: type[Value]) -> Value | None:
         with self._lock:
-            self._grids[key] = grid
-            while len(self._grids) > 1 and sum(g.nbytes for g in self._grids.values()) > self._max_bytes:
-                self._grids.popitem(last=False)
-        return grid
+            held = self._held.get(key)
+        return held if isinstance(held, kind) else None
+
+    def put(self, key: Hashable, value: Weighed) -> None:
+        """Hold a value, and let go of what was used longest ago until all fits."""
+        with self._lock:
+            self._held[key] = value
+            self._held.move_to_end(key)
+            while len(self._held) > 1 and sum(each.nbytes for each in self._held.values()) > self._max_bytes:
+                self._held.popitem(last=False)
+
+    @property
+    def nbytes(self) -> int:
+        with self._lock:
+            return sum(each.nbytes for each in self._held.values())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Walks:
+    by_survey: dict[str, Walk]
+
+    @property
+    def nbytes(self) -> int:
+        return sum(
+            w.samples.B_uT.nbytes + w.p_building_m.nbytes + w.samples.t_s.nbytes for w in self.by_survey.values()
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layer:
+    values: Array
+
+    @property
+    def nbytes(self) -> int:
+        return self.values.nbytes
 
 
 class OrganisationContent:
     """What one organisation's viewer can reach: there is no way to name another's object here."""
 
-    def __init__(self, organisation_id: str, source: ViewerSource, grids: GridCache) -> None:
+    def __init__(self, organisation_id: str, source: ViewerSource, recent: RecentlyUsed) -> None:
         self._organisation_id = organisation_id
         self._source = source
-        self._grids = grids
+        self._recent = recent
 
     def buildings(self) -> list[ViewedBuilding]:
         return self._source.buildings(self._organisation_id)
 
-    def grid(self, map_id: str) -> FieldGrid:
-        return self._grids.get(self._source, self._organisation_id, map_id)
+    def map(self, map_id: str) -> ViewedMap:
+        """Raises NotFound."""
+        key = (self._organisation_id, "map", map_id)
+        return self._recent.get(key, ViewedMap, lambda: self._source.map(self._organisation_id, map_id))
+
+    def layer(self, map_id: str, layer: str, height_index: int, versus_id: str | None = None) -> Array:
+        """One layer of a map at one height, (ny, nx); `difference` is the one to the map `versus_id`.
+
+        Raises NotFound, InvalidInput.
+        """
+
+        def make() -> Array:
+            shown = self.map(map_id)
+            stored = dict(shown.stored)
+            if layer == "difference" and versus_id is not None:
+                stored["difference"] = difference_uT(shown.grid, self.map(versus_id).grid)
+            return layer_values(shown.grid, layer, height_index, stored)
+
+        key = (self._organisation_id, "layer", map_id, layer, height_index, versus_id)
+        return self._recent.get(key, _Layer, lambda: _Layer(make())).values
 
     def walks(self, floor_id: str) -> list[Walk]:
-        return self._source.walks(self._organisation_id, floor_id)
+        """Raises NotFound."""
+        key = (self._organisation_id, "walks", floor_id)
+        known = self._recent.peek(key, _Walks)
+        walks = self._source.walks(self._organisation_id, floor_id, known.by_survey if known else {})
+        self._recent.put(key, _Walks({walk.survey_id: walk for walk in walks}))
+        return walks

@@ -1,5 +1,6 @@
 """The viewer's source on the real storage: rows by SQLAlchemy, grids and samples by their hash in the blob store."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,14 @@ from sqlalchemy.orm import Session, sessionmaker
 from app.blobs import BlobStore
 from app.db.tables import Building, Floor, Map, Survey
 from app.errors import NotFound
-from app.field.grid import FieldGrid
+from app.field.samples import Samples
 from app.geometry import Array
-from app.services.artefacts import grid_from_bytes, samples_from_bytes
-from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
+from app.services.artefacts import grid_from_bytes, layers_from_bytes, samples_from_bytes
+from app.viewer.source import ViewedBuilding, ViewedFloor, ViewedMap, Walk
 
 __all__ = ["DatabaseViewerSource", "rings_of_polygon"]
+
+_MOST_SAMPLES = 5_000  # of a walk: at a walking pace one every few centimetres
 
 
 class DatabaseViewerSource:
@@ -41,17 +44,20 @@ class DatabaseViewerSource:
             )
             return [ViewedBuilding(b.id, b.name, tuple(floors_of.get(b.id, ()))) for b in buildings]
 
-    def grid(self, organisation_id: str, map_id: str) -> FieldGrid:
-        """The grid of a map. Raises NotFound, CorruptArtefact."""
+    def map(self, organisation_id: str, map_id: str) -> ViewedMap:
+        """A map that is ready, with what is stored beside its grid. Raises NotFound, CorruptArtefact."""
         with self._sessions() as session:
-            sha256 = session.scalars(
-                select(Map.grid_sha256).where(Map.id == map_id, Map.organisation_id == organisation_id)
+            row = session.execute(
+                select(Map.floor_id, Map.grid_sha256, Map.layers_sha256).where(
+                    Map.id == map_id, Map.organisation_id == organisation_id, Map.grid_sha256.is_not(None)
+                )
             ).one_or_none()
-        if sha256 is None:
+        if row is None:
             raise NotFound(f"no map {map_id} that is ready; `GET /v1/maps/{map_id}` says how it stands")
-        return grid_from_bytes(self._blobs.get(sha256))
+        stored = {} if row.layers_sha256 is None else layers_from_bytes(self._blobs.get(row.layers_sha256))
+        return ViewedMap(row.floor_id, grid_from_bytes(self._blobs.get(row.grid_sha256)), stored)
 
-    def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
+    def walks(self, organisation_id: str, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
         """The included surveys of a floor in order of arrival. Raises NotFound, CorruptArtefact."""
         with self._sessions() as session:
             floor = session.get(Floor, floor_id)
@@ -62,11 +68,13 @@ class DatabaseViewerSource:
                 .where(Survey.floor_id == floor_id, Survey.included)
                 .order_by(Survey.id)
             ).all()
-        return [self._walk(*row) for row in rows]
+        return [known.get(row[0]) or self._walk(*row) for row in rows]
 
     def _walk(self, survey_id: str, name: str, samples_sha256: str) -> Walk:
         samples = samples_from_bytes(self._blobs.get(samples_sha256))
-        return Walk(survey_id, name, samples.p_building_m, samples.B_uT)
+        kept = slice(None, None, -(-len(samples) // _MOST_SAMPLES))
+        thinned = Samples(samples.t_s[kept], samples.p_building_m[kept], samples.B_uT[kept], samples.frame)
+        return Walk(survey_id, name, thinned)
 
 
 def _viewed(floor: Floor, grid_sha256: str | None) -> ViewedFloor:

@@ -3,56 +3,77 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from html import escape
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.viewer import scene as draw
-from app.viewer.layers import LAYERS, ColourScale, colour_scale, layer_values
+from app.viewer.asked import Marks
+from app.viewer.layers import ColourScale, colour_scale, layer_values
+from app.viewer.marks import blend_likelihood
+from app.viewer.pointing import walk_residual_uT
 from app.viewer.source import ViewedFloor, Walk
 
 if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi, SceneNodeHandle
 
-__all__ = ["OUTLINE_RGB", "DrawnFloor", "ShownFloor", "describe_floors", "draw_floor", "shared_scales"]
+__all__ = ["OUTLINE_RGB", "DrawnFloor", "ShownFloor", "residual_scale", "shared_scales", "walk_residuals"]
 
 OUTLINE_RGB = (190, 200, 210)
+_UNKNOWN_RGB = (140, 140, 140)
+_RESIDUAL_MAP = "YlOrRd"
+_RESIDUAL_OVER_M = 1.0
+_DIMMED = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownFloor:
     """A floor with what is drawn of it.
 
-    values: the chosen layer (ny, nx), NaN where unmeasured; None without a map.
+    map_id, grid  of the map that is shown; None without one
+    values        the chosen layer (ny, nx), NaN where unmeasured
+    residual_uT   of each walk: (n,) length of what it measured less the map, NaN where that is not known
     """
 
     floor: ViewedFloor
     walks: list[Walk]
+    map_id: str | None = None
     grid: FieldGrid | None = None
     values: Array | None = None
     height_index: int = 0
+    residual_uT: tuple[Array, ...] = ()
 
-    @classmethod
-    def of(
-        cls, floor: ViewedFloor, walks: list[Walk], grid: FieldGrid | None, layer: str, height_index: int
-    ) -> ShownFloor:
-        """A floor with one layer at one height, or at its highest when it has fewer heights."""
-        if grid is None:
-            return cls(floor, walks)
-        k = min(height_index, len(grid.heights_m) - 1)
-        return cls(floor, walks, grid, layer_values(grid, layer, k), k)
+    @property
+    def height_m(self) -> float:
+        """Where the layer lies, and what is marked on the floor."""
+        return self.floor.elevation_m if self.grid is None else float(self.grid.heights_m[self.height_index])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrawnFloor:
-    """The nodes of a floor: the frame that all of it hangs on, and what can be hidden, by kind."""
+def walk_residuals(grid: FieldGrid, walks: Sequence[Walk]) -> tuple[Array, ...]:
+    """(n,) of each walk: length of the mean, over a metre walked, of what was measured less the map, uT.
 
-    frame: FrameHandle
-    nodes: dict[str, SceneNodeHandle] = field(default_factory=dict)
+    NaN where that is not known. The mean leaves out the sensor's noise, which says nothing of the map.
+    """
+    return tuple(_residual_uT(grid, walk) for walk in walks)
+
+
+def _residual_uT(grid: FieldGrid, walk: Walk) -> Array:
+    residual_uT = walk_residual_uT(grid, walk)
+    if residual_uT is None:
+        return np.full(len(walk.samples), np.nan)
+    path_m = walk.samples.path_length_m()
+    known = np.isfinite(residual_uT[:, :1])
+    sums = np.cumsum(np.vstack([np.zeros(residual_uT.shape[1] + 1),
+                                np.hstack([np.where(known, residual_uT, 0.0), known])]), axis=0)  # fmt: skip
+    first = np.searchsorted(path_m, path_m - _RESIDUAL_OVER_M / 2.0)
+    last = np.searchsorted(path_m, path_m + _RESIDUAL_OVER_M / 2.0, side="right")
+    near = sums[last] - sums[first]
+    mean_uT = near[:, :-1] / np.maximum(near[:, -1:], 1.0)
+    return np.where(known[:, 0], np.linalg.norm(mean_uT, axis=1), np.nan)
 
 
 def shared_scales(shown: Sequence[ShownFloor], layer: str) -> tuple[ColourScale, ColourScale]:
@@ -61,58 +82,66 @@ def shared_scales(shown: Sequence[ShownFloor], layer: str) -> tuple[ColourScale,
     return colour_scale(layer, [s.values for s in shown if s.values is not None]), colour_scale("norm", norms)
 
 
-def draw_floor(
-    scene: SceneApi,
-    name: str,
-    shown: ShownFloor,
-    scale: ColourScale,
-    norm_scale: ColourScale,
-    origin_m: Array,
-    arrow_spacing_m: float,
-) -> DrawnFloor:
-    """Put a floor into a scene under `name`: outline, walks, label, the layer and field arrows."""
-    drawn = DrawnFloor(scene.add_frame(name, show_axes=False))
-    outline = draw.ring_segments(shown.floor.rings_m, shown.floor.elevation_m, origin_m)
-    if len(outline):
-        drawn.nodes["outline"] = draw.draw_lines(scene, f"{name}/outline", outline, OUTLINE_RGB, 2.0)
-    segments, colours = draw.walk_segments(shown.walks, origin_m)
-    if len(segments):
-        drawn.nodes["walks"] = draw.draw_lines(scene, f"{name}/walks", segments, colours, 2.0)
-    label = shown.floor.name if shown.grid is not None else f"{shown.floor.name}: no map yet"
-    scene.add_label(f"{name}/label", label, position=_label_position(shown, origin_m), anchor="bottom-right")
-    if shown.grid is None or shown.values is None:
-        return drawn
-    picture = draw.surface(shown.grid, shown.values, scale, origin_m, shown.height_index)
-    draw.draw_surface(scene, f"{name}/layer", picture)
-    arrows = draw.field_arrows(shown.grid, origin_m, arrow_spacing_m, shown.height_index)
-    if len(arrows.ends_m):
-        drawn.nodes["arrows"] = draw.draw_arrows(scene, f"{name}/arrows", arrows, norm_scale)
-    return drawn
+def residual_scale(shown: Sequence[ShownFloor]) -> ColourScale | None:
+    """From nothing to the 95th percentile of every walk's residual; None when none is known."""
+    known = np.concatenate([np.zeros(0), *(r[np.isfinite(r)] for s in shown for r in s.residual_uT)])
+    return ColourScale(0.0, max(float(np.percentile(known, 95.0)), 1e-3), _RESIDUAL_MAP) if len(known) else None
 
 
-def describe_floors(shown: Sequence[ShownFloor], layer: str) -> str:
-    """The picture in words and numbers as HTML, one paragraph a floor.
+class DrawnFloor:
+    """The nodes of a floor under one frame, each drawn anew by itself."""
 
-    Not Markdown: viser reads the pictures that Markdown names from the server's disk, and a floor may have any name.
-    """
-    lines = [_describe(s, LAYERS[layer].unit) for s in shown]
-    grids = [s.grid for s in shown if s.grid is not None]
-    lines.append(f"Ground squares are {draw.ground_cell_m(grids):g} m.")
-    paragraphs = "".join(f'<p style="margin:0.5em 0">{line}</p>' for line in lines)
-    return f'<div style="padding:0 0.6em"><div style="font-size:0.85em">{paragraphs}</div></div>'
+    def __init__(self, scene: SceneApi, name: str, shown: ShownFloor, origin_m: Array) -> None:
+        self.name, self.shown, self.origin_m = name, shown, origin_m
+        self._scene = scene
+        self.frame: FrameHandle = scene.add_frame(name, show_axes=False)
+        self.nodes: dict[str, SceneNodeHandle] = {}
+        self._layer_drawn: object = None
+        outline = draw.ring_segments(shown.floor.rings_m, shown.floor.elevation_m, origin_m)
+        if len(outline):
+            self.nodes["outline"] = draw.draw_lines(scene, f"{name}/outline", outline, OUTLINE_RGB, 2.0)
+        label = shown.floor.name if shown.grid is not None else f"{shown.floor.name}: no map yet"
+        scene.add_label(f"{name}/label", label, position=_label_position(shown, origin_m), anchor="bottom-right")
+
+    def draw_layer(self, shown: ShownFloor, scale: ColourScale, marks: Marks) -> None:
+        """The chosen layer as a picture in its plane; dimmed under marks, and a likelihood over it."""
+        likelihood = marks.likelihood if marks.likelihood and marks.likelihood.floor_id == shown.floor.id else None
+        wanted = (shown.map_id, None if shown.values is None else id(shown.values), scale, bool(marks), likelihood)
+        self.shown = shown
+        if shown.grid is None or shown.values is None or wanted == self._layer_drawn:
+            return
+        picture = draw.surface(shown.grid, shown.values, scale, self.origin_m, shown.height_index)
+        if marks:
+            picture.rgba[..., :3] = np.round(_DIMMED * picture.rgba[..., :3])
+        if likelihood is not None:
+            blend_likelihood(picture, likelihood, self.origin_m)
+        draw.draw_surface(self._scene, f"{self.name}/layer", picture)
+        self._layer_drawn = wanted
+
+    def draw_walks(self, scale: ColourScale | None, visible: bool) -> None:
+        """The walks, in the colours of their residuals."""
+        if not self.shown.walks:
+            return
+        colours = None if scale is None else [_residual_rgb(r, scale) for r in self.shown.residual_uT]
+        segments, rgb = draw.walk_segments(self.shown.walks, self.origin_m, colours or None)
+        self.nodes["walks"] = draw.draw_lines(self._scene, f"{self.name}/walks", segments, rgb, 3.0, visible)
+
+    def draw_arrows(self, scale: ColourScale, spacing_m: float, box_m: draw.Box, visible: bool) -> int:
+        """Field arrows in a part of the floor; returns how many."""
+        if self.shown.grid is None:
+            return 0
+        arrows = draw.field_arrows(self.shown.grid, self.origin_m, spacing_m, self.shown.height_index, box_m)
+        name = f"{self.name}/arrows"
+        self._scene.remove_by_name(name)
+        self.nodes.pop("arrows", None)
+        if len(arrows.ends_m):
+            self.nodes["arrows"] = draw.draw_arrows(self._scene, name, arrows, scale, visible)
+        return len(arrows.ends_m)
 
 
-def _describe(shown: ShownFloor, unit: str) -> str:
-    name = escape(shown.floor.name)
-    walks = "1 walk" if len(shown.walks) == 1 else f"{len(shown.walks)} walks"
-    if shown.grid is None or shown.values is None or not np.isfinite(shown.values).any():
-        return f"<strong>{name}</strong>: no map yet, {walks}"
-    low, middle, high = np.nanpercentile(shown.values, [5.0, 50.0, 95.0])
-    area_m2 = np.isfinite(shown.values).sum() * shown.grid.resolution_m**2
-    return (
-        f"<strong>{name}</strong>: median {middle:.3g} {unit}, 90 % from {low:.3g} to {high:.3g}; "
-        f"{area_m2:,.0f} m² measured, {walks}"
-    )
+def _residual_rgb(residual_uT: Array, scale: ColourScale) -> NDArray[np.uint8]:
+    known = np.isfinite(residual_uT)[:, None]
+    return np.where(known, scale.rgb(residual_uT), np.array(_UNKNOWN_RGB, dtype=np.uint8)).astype(np.uint8)
 
 
 def _label_position(shown: ShownFloor, origin_m: Array) -> tuple[float, float, float]:

@@ -24,6 +24,7 @@ __all__ = [
     "about_layer",
     "check_layer",
     "colour_scale",
+    "difference_uT",
     "layer_names",
     "layer_values",
     "legend_html",
@@ -38,10 +39,11 @@ NONE_STORED: StoredLayers = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """How a layer is named, in which unit it is, and which of matplotlib's colour maps shows it."""
+    """How a layer is named, in which unit it is, which of matplotlib's colour maps shows it, and how it is read."""
 
     title: str
     unit: str
+    about: str
     colour_map: str = "viridis"
     short: str = ""  # where the title is too long
 
@@ -56,31 +58,53 @@ def _expected_error_title(window: WindowModel) -> str:
     return f"Expected error of a {window.length_m:g} m window, {window.noise_uT:g} µT noise{offset}{heading} (rms)"
 
 
+_COMPONENT = "One component of the mean field, in the building's own axes."
+_ALONG = "The part of the gradient that is met when walking this way."
+
 LAYERS: dict[str, Layer] = {
-    "norm": Layer("Magnitude |B|", "µT"),
-    "bx": Layer("Component Bx (along the plan's x)", "µT"),
-    "by": Layer("Component By (along the plan's y)", "µT"),
-    "bz": Layer("Component Bz (up)", "µT"),
-    "horizontal": Layer("Horizontal magnitude", "µT"),
-    "vertical": Layer("Vertical component (up)", "µT"),
-    "sd": Layer("Uncertainty (1 sd, all components)", "µT", "cividis"),
-    "gradient": Layer("Gradient along the floor", "µT/m"),
-    "gradient_x": Layer("Gradient along x", "µT/m"),
-    "gradient_y": Layer("Gradient along y", "µT/m"),
-    "information": Layer(_information_title(USUAL), "1/m²", short="Information"),
-    "expected_error": Layer(_expected_error_title(USUAL), "m", "cividis", "Expected error, rms"),
-    "coverage": Layer("Coverage (surveys within 1 m)", "", "cividis"),
-    "conflict": Layer("Conflict (errors of left-out surveys / their stated sd)", "", "magma"),
-    "measured": Layer("Measured cells", "", "cividis"),
-}
-STORED_LAYERS = ("coverage", "conflict")  # from the fit, beside the grid: an older map has none
+    "norm": Layer("Magnitude |B|", "µT", "Length of the mean field. Steel bends it: every bump is a landmark."),
+    "bx": Layer("Component Bx (along the plan's x)", "µT", _COMPONENT),
+    "by": Layer("Component By (along the plan's y)", "µT", _COMPONENT),
+    "bz": Layer("Component Bz (up)", "µT", _COMPONENT),
+    "horizontal": Layer("Horizontal magnitude", "µT", "What a compass needle feels, whichever way it faces."),
+    "vertical": Layer("Vertical component (up)", "µT", "Needs no heading, so a phone knows it well."),
+    "sd": Layer(
+        "Uncertainty (1 sd, all components)", "µT",
+        "How far the true field may be from the map's: small along the walks, large away from them.", "cividis"),
+    "inclination": Layer(
+        "Inclination (below the horizontal)", "°", "How steeply the field dips. Outdoors it is the same everywhere."),
+    "gradient": Layer(
+        "Gradient along the floor", "µT/m", "How fast the field changes underfoot. Flat places look alike; steep ones "
+        "tell a step of a few centimetres."),
+    "gradient_x": Layer("Gradient along x", "µT/m", _ALONG),
+    "gradient_y": Layer("Gradient along y", "µT/m", _ALONG),
+    "information": Layer(
+        _information_title(USUAL), "1/m²", "What one reading tells about the position: change of the field over its "
+        "uncertainty, squared.", short="Information"),
+    "expected_error": Layer(
+        _expected_error_title(USUAL), "m", "How well a window that ends here can be placed, by the Cramér-Rao bound.",
+        "cividis", "Expected error, rms"),
+    "coverage": Layer("Coverage (surveys within 1 m)", "", "How many surveys came near: one is no check of another.",
+                      "cividis"),
+    "conflict": Layer(
+        "Conflict (errors of left-out surveys / their stated sd)", "",
+        "About 1 where surveys agree as well as they say; above 2 something moved, or a walk is misplaced.", "magma"),
+    "difference": Layer(
+        "Difference to the other map (of the field vectors)", "µT", "What changed between two versions of the map.",
+        "magma", "Difference"),
+    "measured": Layer("Measured cells", "", "Where the map answers at all.", "cividis"),
+}  # fmt: skip
+STORED_LAYERS = ("coverage", "conflict", "difference")
+"""Not of the grid alone: coverage and conflict are left by the fit (an older map has none), difference needs two maps.
+"""
 
 
 def layer_names(components: Components, stored: Collection[str] = ()) -> tuple[str, ...]:
     """The layers a map of these components has, with those `stored` beside its grid."""
     own = () if components == "norm" else COMPONENT_NAMES[components]
+    dip = () if components == "norm" else ("inclination",)
     told = ("gradient", "gradient_x", "gradient_y", "information", "expected_error")
-    return ("norm", *own, "sd", *told, *(name for name in STORED_LAYERS if name in stored), "measured")
+    return ("norm", *own, *dip, "sd", *told, *(name for name in STORED_LAYERS if name in stored), "measured")
 
 
 def nearest_height(grid: FieldGrid, height_m: float | None) -> int:
@@ -124,8 +148,9 @@ def layer_values(
     """One layer at one height: (ny, nx), NaN where nothing was measured ("measured" itself: 1 and 0, never NaN).
 
     norm is the magnitude of the mean field; sd the root of the summed variances of the components; gradient the
-    Frobenius norm of the derivative with x and y; information and expected_error those of `window`, the latter NaN
-    too where no window that ends there is mapped. Raises InvalidInput naming the layers, or heights, of this map.
+    Frobenius norm of the derivative with x and y; inclination the angle of the mean field below the horizontal,
+    degrees; information and expected_error those of `window`, the latter NaN too where no window that ends there is
+    mapped. Raises InvalidInput naming the layers, or heights, of this map.
     """
     check_layer(grid, layer, stored)
     if not 0 <= height_index < len(grid.heights_m):
@@ -143,6 +168,8 @@ def _raw_values(grid: FieldGrid, layer: str, k: int, window: WindowModel) -> Arr
         return np.asarray(np.linalg.norm(grid.mean_uT[k].astype(np.float64), axis=-1))
     if layer == "sd":
         return np.asarray(np.linalg.norm(grid.sd_uT[k].astype(np.float64), axis=-1))
+    if layer == "inclination":
+        return _inclination_deg(grid, k)
     if layer.startswith("gradient"):
         along = gradient_norms(grid.gradient_uT_per_m[k, ..., :2])  # a third column, where there is one, is with height
         return {"gradient": along.total, "gradient_x": along.x, "gradient_y": along.y}[layer]
@@ -151,6 +178,39 @@ def _raw_values(grid: FieldGrid, layer: str, k: int, window: WindowModel) -> Arr
     if layer == "expected_error":
         return expected_error_m(grid, k, window)
     return np.asarray(grid.mean_uT[k, ..., grid.component_names.index(layer)].astype(np.float64))
+
+
+def _inclination_deg(grid: FieldGrid, k: int) -> Array:
+    mean = grid.mean_uT[k].astype(np.float64)
+    horizontal = mean[..., 0] if grid.components == "level" else np.linalg.norm(mean[..., :2], axis=-1)
+    return np.asarray(np.degrees(np.arctan2(-mean[..., -1], horizontal)))
+
+
+def difference_uT(grid: FieldGrid, other: FieldGrid) -> NDArray[np.float32]:
+    """(nz, ny, nx) length of the difference of two maps' mean fields at the cells of the first, uT.
+
+    Maps of different components are compared by their magnitudes; NaN where either was not measured.
+    """
+    theirs, measured = _at_the_cells_of(grid, other)
+    if grid.components == other.components:
+        difference = np.linalg.norm(grid.mean_uT - theirs, axis=-1)
+    else:
+        difference = np.abs(np.linalg.norm(grid.mean_uT, axis=-1) - np.linalg.norm(theirs, axis=-1))
+    return np.where(grid.measured & measured, difference, np.nan).astype(np.float32)
+
+
+def _at_the_cells_of(grid: FieldGrid, other: FieldGrid) -> tuple[Array, NDArray[np.bool_]]:
+    """The other map's mean (nz, ny, nx, c) and whether it was measured, at every cell of `grid`."""
+    nz, ny, nx = grid.measured.shape
+    x0_m, y0_m = grid.origin_m
+    mean = np.zeros((nz, ny, nx, other.mean_uT.shape[-1]))
+    measured = np.zeros((nz, ny, nx), dtype=np.bool_)
+    x_m = x0_m + grid.resolution_m * np.arange(nx)
+    for k, z_m in enumerate(grid.heights_m):
+        for j in range(ny):  # a row at a time: interpolation holds some twenty copies of what it is asked
+            there = other.at(np.column_stack([x_m, np.full(nx, y0_m + grid.resolution_m * j), np.full(nx, z_m)]))
+            mean[k, j], measured[k, j] = there.mean_uT, there.measured
+    return mean, measured
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,27 +1,29 @@
-"""The page `/view/`: sign in with an API key, then look at your organisation's floors in 3-D.
+"""The page `/view/`: sign in with an API key, then look at your organisation's floors, and work on them.
 
 `ViewerApp` is an ASGI application to be mounted at `/view` in the API's own, so that the page shares its port and
-origin. A signed-in browser is served viser's client under a path that names what it looks at
-(`/view/buildings/ID/floors/ID`), because that client opens its WebSocket at the very path it was loaded from.
+origin. The page itself is plain HTML and JavaScript (`assets/`); in it is a frame with viser's canvas. It asks
+`/view/scene/...` for what the canvas shows, and `/view/v1/...`, the API behind the session's key, for all else.
 """
 
-import asyncio
 import time
 from collections.abc import Callable, Mapping
+from hashlib import sha256
 from http import HTTPStatus
-from urllib.parse import parse_qs, quote, urlsplit
+from importlib.resources import files
+from urllib.parse import urlencode
 
-import httpx
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, RedirectResponse, Response
-from starlette.routing import BaseRoute, Route, Router, WebSocketRoute
-from starlette.types import Receive, Scope, Send
-from starlette.websockets import WebSocket
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.routing import BaseRoute, Route, Router
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.viewer.client_view import Link
-from app.viewer.proxy import CLOSE_SIGNED_OUT, PAGE_POLICY, ViserPage, fetch_page, relay
+from app.errors import TooLarge
+from app.viewer.api_door import ApiDoor
+from app.viewer.requests import SECURITY_HEADERS, read_form, refusal, same_origin
+from app.viewer.scene_endpoints import SceneEndpoints
 from app.viewer.sessions import Session, SignedIn
-from app.viewer.sign_in import SIGN_IN_POLICY, sign_in_html
+from app.viewer.sign_in import LINK, SIGN_IN_POLICY, sign_in_html
 from app.viewer.source import Authenticate, ViewerSource
 from app.viewer.viser_pool import ViserPool
 
@@ -29,14 +31,11 @@ __all__ = ["COOKIE", "ViewerApp"]
 
 COOKIE = "isodyn_view"
 _MOST_FORM_BYTES = 4096
-_SECURITY_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "same-origin",  # "no-referrer" would make forms send the Origin "null"
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
-}
+_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+_SHELL_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
 
 
 class ViewerApp:
@@ -44,6 +43,7 @@ class ViewerApp:
 
     authenticate       an API key to its identity, or None; called in a worker thread
     source             what can be shown, asked with the organisation of the signed-in key
+    api                the application that answers `/v1/...`; without one the page can look, and change nothing
     session_seconds    how long a sign-in lasts
     idle_seconds       how long an organisation's viser server outlives its last visitor
 
@@ -55,30 +55,32 @@ class ViewerApp:
         authenticate: Authenticate,
         source: ViewerSource,
         *,
+        api: ASGIApp | None = None,
         session_seconds: float = 8 * 3600.0,
         idle_seconds: float = 600.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.signed_in = SignedIn(authenticate, session_seconds, clock)
         self.pool = ViserPool(source, idle_seconds, clock)
+        self._source = source
         self._session_seconds = session_seconds
-        self._page: ViserPage | None = None
-        self._router = Router(self._routes(), redirect_slashes=False)
+        self._assets = _read_assets()
+        scenes = SceneEndpoints(self.signed_in, self.pool, COOKIE)
+        self._router = Router([*self._routes(), *scenes.routes()], redirect_slashes=False)
+        if api is not None:
+            self._router.mount("/v1", ApiDoor(api, self.signed_in, COOKIE))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self._router(scope, receive, send)
 
     def _routes(self) -> list[BaseRoute]:
-        # Not "/" for the page: viser's client drops the slash at the end of its own address, and a WebSocket at the
-        # very prefix of a mounted application never reaches it.
-        pages = ("/buildings", "/buildings/{building}", "/buildings/{building}/floors/{floor}")
         return [
             Route("/", self._show, methods=["GET"]),
             Route("/session", self._sign_in, methods=["POST"]),
             Route("/session", self._session_state, methods=["GET"]),
             Route("/sign-out", self._sign_out, methods=["POST"]),
-            *(Route(page, self._show, methods=["GET"]) for page in pages),
-            *(WebSocketRoute(page, self._connect) for page in pages),
+            Route("/assets/{name}", self._asset, methods=["GET"]),
+            Route("/content", self._content, methods=["GET"]),
         ]
 
     async def close(self) -> None:
@@ -87,37 +89,27 @@ class ViewerApp:
         await self.pool.close()
 
     async def _show(self, request: Request) -> Response:
-        """The sign-in page, or the page itself; what a query asks for moves into the path."""
-        link = _link(request.path_params, request.query_params)
-        session = await self._session(request)
-        if session is None:
-            return _sign_in_page(request, link)
-        address = _address(request, link)
-        if request.query_params or request.url.path != address:
-            return RedirectResponse(address, HTTPStatus.SEE_OTHER)
-        async with self.pool.visit(session.organisation_id) as viewer:
-            try:
-                if self._page is None:  # the same for every organisation
-                    self._page = await fetch_page(viewer.http_url, _prefix(request))
-            except httpx.TransportError:
-                await self.pool.discard(session.organisation_id, viewer)
-                return _refusal(
-                    HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting again; load this page once more"
-                )
-        return _page_response(self._page, request)
+        """The sign-in page, or the page itself, which reads what its address asks for."""
+        if await self._session(request) is None:
+            return _sign_in_page(request, _link(request.query_params))
+        headers = {**SECURITY_HEADERS, "X-Frame-Options": "DENY", "Content-Security-Policy": _SHELL_POLICY,
+                   "Cache-Control": "no-store", "Vary": "Cookie"}  # fmt: skip
+        return HTMLResponse(self._assets["page.html"][0], headers=headers)
 
     async def _sign_in(self, request: Request) -> Response:
         """Take a key, give a cookie."""
-        if not _same_origin(request.headers):
-            return _refusal(HTTPStatus.FORBIDDEN, "sign in from this server's own page")
-        form = await _form(request)
-        if form is None:
-            return _refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the form is too large")
-        link = _link({}, form)
+        if not same_origin(request.headers):
+            return refusal(HTTPStatus.FORBIDDEN, "sign in from this server's own page")
+        try:
+            form = await read_form(request, _MOST_FORM_BYTES)
+        except TooLarge as error:
+            return refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, str(error))
         session = await self.signed_in.open(form.get("key", "").strip())
         if session is None:
-            return _sign_in_page(request, link, wrong_key=True)
-        response = RedirectResponse(_address(request, link), HTTPStatus.SEE_OTHER, _SECURITY_HEADERS)
+            return _sign_in_page(request, _link(form), wrong_key=True)
+        query = urlencode(_link(form))
+        address = f"{_prefix(request)}/" + (f"?{query}" if query else "")
+        response = RedirectResponse(address, HTTPStatus.SEE_OTHER, SECURITY_HEADERS)
         response.set_cookie(
             COOKIE,
             session.id,
@@ -138,36 +130,54 @@ class ViewerApp:
         )
 
     async def _sign_out(self, request: Request) -> Response:
-        if not _same_origin(request.headers):
-            return _refusal(HTTPStatus.FORBIDDEN, "sign out from this server's own page")
+        if not same_origin(request.headers):
+            return refusal(HTTPStatus.FORBIDDEN, "sign out from this server's own page")
         session = await self._session(request)
         if session is not None:
             self.signed_in.close(session)
-        response = RedirectResponse(f"{_prefix(request)}/", HTTPStatus.SEE_OTHER, _SECURITY_HEADERS)
+        response = RedirectResponse(f"{_prefix(request)}/", HTTPStatus.SEE_OTHER, SECURITY_HEADERS)
         response.delete_cookie(COOKIE, path=_prefix(request), httponly=True, samesite="strict")
         return response
 
-    async def _connect(self, websocket: WebSocket) -> None:
-        """A page's WebSocket: foreign origins get 403 and nothing else; no session, a close with 4401."""
-        if not _same_origin(websocket.headers):
-            await websocket.close()  # before accepting: the handshake is answered with 403
-            return
-        session = await self.signed_in.find(websocket.cookies.get(COOKIE))
+    async def _asset(self, request: Request) -> Response:
+        """A file of the page; there is nothing of anybody in them."""
+        found = self._assets.get(request.path_params["name"])
+        if found is None:
+            return refusal(HTTPStatus.NOT_FOUND, "there is no such file")
+        data, media_type, etag = found
+        headers = {**SECURITY_HEADERS, "Cache-Control": "no-cache", "ETag": etag}
+        if request.headers.get("if-none-match") == etag:
+            return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+        return Response(data, headers=headers, media_type=media_type)
+
+    async def _content(self, request: Request) -> Response:
+        """What the pickers offer: the organisation's buildings and floors, and what the key may do."""
+        session = await self._session(request)
         if session is None:
-            await websocket.accept()
-            await websocket.close(CLOSE_SIGNED_OUT, "not signed in")
-            return
-        ended = asyncio.ensure_future(self.signed_in.until_ended(session))
-        try:
-            async with self.pool.visit(session.organisation_id) as viewer:
-                reached = await relay(websocket, viewer.websocket_url(_link(websocket.path_params, {})), ended)
-            if not reached:
-                await self.pool.discard(session.organisation_id, viewer)
-        finally:
-            ended.cancel()
+            return refusal(HTTPStatus.UNAUTHORIZED, "sign in again")
+        buildings = await run_in_threadpool(self._source.buildings, session.organisation_id)
+        shown = [
+            {"id": b.id, "name": b.name,
+             "floors": [{"id": f.id, "name": f.name, "ordinal": f.ordinal, "map_id": f.map_id} for f in b.floors]}
+            for b in buildings
+        ]  # fmt: skip
+        return JSONResponse(
+            {"scopes": sorted(session.scopes), "buildings": shown}, headers={"Cache-Control": "no-store"}
+        )
 
     async def _session(self, request: Request) -> Session | None:
         return await self.signed_in.find(request.cookies.get(COOKIE))
+
+
+def _read_assets() -> dict[str, tuple[bytes, str, str]]:
+    """The page's files with their media types and tags, by name."""
+    read = {}
+    for file in files("app.viewer").joinpath("assets").iterdir():
+        suffix = file.name[file.name.rfind(".") :]
+        if suffix in _TYPES:
+            data = file.read_bytes()
+            read[file.name] = (data, _TYPES[suffix], f'"{sha256(data).hexdigest()[:32]}"')
+    return read
 
 
 def _prefix(request: Request) -> str:
@@ -175,60 +185,13 @@ def _prefix(request: Request) -> str:
     return str(request.scope.get("root_path", ""))
 
 
-def _address(request: Request, link: Link) -> str:
-    """The page's own path for a link."""
-    address = f"{_prefix(request)}/buildings"
-    if link.building_id is not None:
-        address += f"/{quote(link.building_id, safe='')}"
-        if link.floor_id is not None:
-            address += f"/floors/{quote(link.floor_id, safe='')}"
-    return address
-
-
-def _sign_in_page(request: Request, link: Link, wrong_key: bool = False) -> Response:
-    headers = {**_SECURITY_HEADERS, "Content-Security-Policy": SIGN_IN_POLICY, "Cache-Control": "no-store"}
+def _sign_in_page(request: Request, link: Mapping[str, str], wrong_key: bool = False) -> Response:
+    headers = {**SECURITY_HEADERS, "X-Frame-Options": "DENY", "Content-Security-Policy": SIGN_IN_POLICY,
+               "Cache-Control": "no-store"}  # fmt: skip
     status = HTTPStatus.UNAUTHORIZED if wrong_key else HTTPStatus.OK
     return HTMLResponse(sign_in_html(f"{_prefix(request)}/session", link, wrong_key), status, headers)
 
 
-def _link(path: Mapping[str, str], query: Mapping[str, str]) -> Link:
-    def asked(name: str) -> str | None:
-        return (path.get(name) or query.get(name) or "")[:100] or None
-
-    return Link(asked("building"), asked("floor"))
-
-
-def _same_origin(headers: Mapping[str, str]) -> bool:
-    """Whether the page that asks is this server's: its Origin names the host that was asked. None given is a no."""
-    origin, host = headers.get("origin", ""), headers.get("host", "")
-    parts = urlsplit(origin)
-    return parts.scheme in ("http", "https") and host != "" and parts.netloc.lower() == host.lower()
-
-
-async def _form(request: Request) -> dict[str, str] | None:
-    """The fields of a small form, None when it is larger than any sign-in."""
-    body = b""
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > _MOST_FORM_BYTES:
-            return None
-    return {name: values[0] for name, values in parse_qs(body.decode("utf-8", "replace")).items()}
-
-
-def _page_response(page: ViserPage, request: Request) -> Response:
-    headers = {
-        **_SECURITY_HEADERS,
-        "Content-Security-Policy": PAGE_POLICY,
-        "Cache-Control": "private, no-cache",
-        "ETag": page.etag,
-        "Vary": "Cookie, Accept-Encoding",
-    }
-    if request.headers.get("if-none-match") == page.etag:
-        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    if "gzip" in request.headers.get("accept-encoding", ""):
-        return HTMLResponse(page.gzipped, headers={**headers, "Content-Encoding": "gzip"})
-    return HTMLResponse(page.html, headers=headers)
-
-
-def _refusal(status: HTTPStatus, reason: str) -> Response:
-    return Response(f"{reason}\n", status, _SECURITY_HEADERS, media_type="text/plain")
+def _link(asked: Mapping[str, str]) -> dict[str, str]:
+    """What a deep link may ask for, and nothing else of a query."""
+    return {name: asked[name][:200] for name in LINK if asked.get(name)}

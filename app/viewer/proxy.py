@@ -1,8 +1,9 @@
-"""Between a signed-in browser and its organisation's viser server: the page over HTTP, messages over WebSocket.
+"""Between a signed-in browser and its organisation's viser server: the canvas over HTTP, messages over WebSocket.
 
-viser trusts whoever connects. Here only messages this page needs pass towards it; the rest (asking for a public share
-address, uploads, answers to questions nobody asked) is dropped. Cookies never travel on. The page is served with a
-policy that lets it talk to its own origin only, because viser's client would connect to any address in its URL.
+viser trusts whoever connects. Here only where the camera is passes towards it; the rest (asking for a public share
+address, setting controls, uploads, answers to questions nobody asked) is dropped. Cookies never travel on. The page is
+served with a policy that lets it talk to its own origin only, because viser's client would connect to any address in
+its URL.
 """
 
 import asyncio
@@ -29,30 +30,20 @@ CLOSE_UNREACHABLE = 1011
 _MOST_MESSAGE_BYTES = 64 * 2**10  # of a message from the browser: a camera or a control is far smaller
 _MOST_SCENE_BYTES = 64 * 2**20
 
-# What the page's own controls send. A new kind of control needs its message here.
-_PASSING = frozenset({"ViewerCameraMessage", "GuiUpdateMessage"})
+# The page's controls are not viser's: they ask over HTTP. viser itself is told where the camera is, and nothing else.
+_PASSING = frozenset({"ViewerCameraMessage"})
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src data:; connect-src 'self' data: blob:; worker-src blob: data:; "
-    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    "form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
 )
 
-_OVERLAY = """
-<style>.isodyn-bar{position:fixed;left:1rem;bottom:1rem;z-index:10}
-.isodyn-bar button{font:13px system-ui,sans-serif;padding:.4rem .8rem;border-radius:.4rem;cursor:pointer;
-border:1px solid #495057;background:rgba(26,27,30,.85);color:#e9ecef}
-.isodyn-bar button:focus-visible{outline:2px solid #74c0fc;outline-offset:2px}</style>
-<form class="isodyn-bar" method="post" action="PREFIX/sign-out"><button>Sign out</button></form>
-<script>
-(() => {
-  const look = () => fetch("PREFIX/session", {cache: "no-store"})
-    .then((answer) => { if (answer.status === 401) location.reload(); }).catch(() => {});
-  setInterval(look, 60000);
-  document.addEventListener("visibilitychange", () => { if (!document.hidden) look(); });
-})();
-</script>
-"""
+# viser's own panels, notices and keyboard help have nothing to say here; its canvas fills the frame.
+_ONLY_THE_CANVAS = (
+    "<style>[data-dock-root]>:not(:first-child),.mantine-Notifications-root,.mantine-Paper-root,"
+    "[data-mantine-shared-portal-node]{display:none!important}body{background:#1b1d22}</style>"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,30 +55,26 @@ class ViserPage:
     etag: str
 
 
-async def fetch_page(http_url: str, prefix: str) -> ViserPage:
-    """Fetch viser's page from its server and give it our title, a way to sign out, and an eye on the session."""
+async def fetch_page(http_url: str) -> ViserPage:
+    """Fetch viser's page from its server and leave only its canvas to be seen."""
     async with httpx.AsyncClient(trust_env=False) as client:
         answer = await client.get(http_url, headers={"Accept-Encoding": "identity"})
         answer.raise_for_status()
-    page = answer.text.replace("<title>Viser</title>", "<title>Isodyn</title>", 1)
-    html = page.replace('<div id="root"></div>', f'<div id="root"></div>{_OVERLAY.replace("PREFIX", prefix)}', 1)
+    page = answer.text.replace("<title>Viser</title>", "<title>Isodyn scene</title>", 1)
+    html = page.replace("</head>", f"{_ONLY_THE_CANVAS}</head>", 1)
     data = html.encode()
     return ViserPage(data, gzip.compress(data, 6, mtime=0), f'"{hashlib.sha256(data).hexdigest()[:32]}"')
 
 
 def passes(message: bytes) -> bool:
-    """Whether a browser's message may go on to viser: small, readable, of a kind the page's controls send."""
+    """Whether a browser's message may go on to viser: small, readable, and about the camera."""
     if len(message) > _MOST_MESSAGE_BYTES:
         return False
     try:
         decoded = msgspec.msgpack.decode(message)
     except (msgspec.DecodeError, RecursionError):
         return False
-    if not isinstance(decoded, dict) or decoded.get("type") not in _PASSING:
-        return False
-    if decoded["type"] == "GuiUpdateMessage":  # viser would set any attribute named here
-        return isinstance(decoded.get("updates"), dict) and set(decoded["updates"]) <= {"value"}
-    return True
+    return isinstance(decoded, dict) and decoded.get("type") in _PASSING
 
 
 async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[None]) -> bool:

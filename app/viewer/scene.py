@@ -29,7 +29,9 @@ __all__ = [
     "MAX_POINTS",
     "WALK_COLOURS",
     "Arrows",
+    "Box",
     "Surface",
+    "arrow_view",
     "camera_pose",
     "draw_arrows",
     "draw_ground",
@@ -87,11 +89,12 @@ def local_origin_m(grids: Sequence[FieldGrid], rings_m: Sequence[Array] = (), wa
 
 
 def camera_pose(
-    grids: Sequence[FieldGrid], origin_m: Array, top: bool = False, spread_m: float = 0.0
+    grids: Sequence[FieldGrid], origin_m: Array, top: bool = False, spread_m: float = 0.0, aspect: float = 1.6
 ) -> tuple[Array, Array]:
     """Camera position and look-at point (3,) each, local metres: from the south, or from straight above.
 
-    spread_m: how much higher the topmost floor is drawn than it is.
+    spread_m  how much higher the topmost floor is drawn than it is
+    aspect    width of the picture by its height: a narrow one is looked at from farther away
     """
     bounds = np.array([grid.bounds_m for grid in grids] or [(-5.0, -5.0, 0.0, 5.0, 5.0, 0.0)])
     low, high = bounds[:, :3].min(axis=0) - origin_m, bounds[:, 3:].max(axis=0) - origin_m
@@ -99,8 +102,9 @@ def camera_pose(
     target = (low + high) / 2
     width, depth, height = high - low
     if top:
-        return target + np.array([0.0, -1e-3, 0.85 * max(width, depth, 2.0) + height / 2]), target
-    reach = max(float(np.hypot(width, depth)), 2.0) * 0.57 + 0.45 * height
+        reach = 0.72 * max(width / aspect, depth, 2.0)
+        return target + np.array([0.0, -1e-3, reach + height / 2]), target
+    reach = (max(float(np.hypot(width, depth)), 2.0) * 0.57 + 0.45 * height) * max(1.0, 1.25 / aspect)
     slant = np.array([-0.12, -0.8, 0.8]) if height < 0.2 * depth else np.array([-0.2, -0.9, 0.75])
     return target + reach * slant / np.linalg.norm(slant) * 1.25, target
 
@@ -155,17 +159,26 @@ def suggested_separation_m(grids: Sequence[FieldGrid]) -> float:
     return float(np.clip(np.round(2.0 * (0.85 * depth - gap)) / 2.0, 0.0, 40.0))
 
 
-def field_arrows(grid: FieldGrid, origin_m: Array, spacing_m: float, height_index: int = 0) -> Arrows:
+Box = tuple[float, float, float, float]
+"""x_min, y_min, x_max, y_max in building metres."""
+
+
+def field_arrows(
+    grid: FieldGrid, origin_m: Array, spacing_m: float, height_index: int = 0, box_m: Box | None = None
+) -> Arrows:
     """The mean field at every measured cell of a coarser lattice, at most MAX_ARROWS, standing on the map's plane.
+
+    `box_m`: only those inside.
 
     The 99th percentile of the magnitudes spans 1.2 times the spacing. A level map knows only the vertical direction, so
     its arrows are vertical; a norm map has none.
     """
     components = {"vector": 3, "level": 2, "norm": 0}[grid.components]
     stride = max(1, round(spacing_m / grid.resolution_m))
-    while components and grid.measured[height_index, ::stride, ::stride].sum() > MAX_ARROWS:
+    seen = grid.measured[height_index] if box_m is None else _inside(grid, box_m) & grid.measured[height_index]
+    while components and seen[::stride, ::stride].sum() > MAX_ARROWS:
         stride += 1
-    j, i = np.nonzero(grid.measured[height_index, ::stride, ::stride])
+    j, i = np.nonzero(seen[::stride, ::stride])
     if components == 0 or len(j) == 0:
         return Arrows(np.zeros((0, 2, 3), dtype=np.float32), np.zeros(0), stride * grid.resolution_m)
     j, i = j * stride, i * stride
@@ -182,16 +195,44 @@ def field_arrows(grid: FieldGrid, origin_m: Array, spacing_m: float, height_inde
     return Arrows(np.stack([tail, tail + direction], axis=1).astype(np.float32), magnitude, spacing)
 
 
-def walk_segments(walks: Sequence[Walk], origin_m: Array) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Walks as line segments (m, 2, 3) and their colours (m, 2, 3), one colour per walk, thinned when very long."""
+def _inside(grid: FieldGrid, box_m: Box) -> NDArray[np.bool_]:
+    """(ny, nx) the cells whose centres are in a box."""
+    ny, nx = grid.measured.shape[1:]
+    x_m = grid.origin_m[0] + grid.resolution_m * np.arange(nx)
+    y_m = grid.origin_m[1] + grid.resolution_m * np.arange(ny)
+    x_low, y_low, x_high, y_high = box_m
+    return ((y_m >= y_low) & (y_m <= y_high))[:, None] & ((x_m >= x_low) & (x_m <= x_high))[None, :]
+
+
+def arrow_view(position_m: Array, look_at_m: Array, resolution_m: float) -> tuple[float, Box]:
+    """How far apart arrows stand for a camera (local metres), and the part of the floor they fill around its target.
+
+    Both change in steps of two, so that a small move changes nothing: the nearer, the closer together.
+    """
+    distance_m = max(float(np.linalg.norm(position_m - look_at_m)), 1.0)
+    spacing_m = resolution_m * 2.0 ** np.round(np.log2(max(distance_m / 24.0 / resolution_m, 1.0)))
+    half_m = 48.0 * spacing_m
+    x, y = np.round(look_at_m[:2] / (half_m / 2.0)) * (half_m / 2.0)
+    return float(spacing_m), (float(x - half_m), float(y - half_m), float(x + half_m), float(y + half_m))
+
+
+def walk_segments(
+    walks: Sequence[Walk], origin_m: Array, colours_of: Sequence[NDArray[np.uint8]] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Walks as line segments (m, 2, 3) and their colours (m, 2, 3), thinned when very long.
+
+    colours_of: (n, 3) for the samples of each walk; without it each walk has one colour.
+    """
     total = sum(len(walk.p_building_m) for walk in walks)
     stride = max(1, int(np.ceil(total / _MAX_WALK_SEGMENTS)))
     segments, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), dtype=np.uint8)]
     for k, walk in enumerate(walks):
         p = walk.p_building_m[::stride] - origin_m + np.array([0.0, 0.0, _CLEARANCE_M])
         segments.append(np.stack([p[:-1], p[1:]], axis=1))
-        colour = np.array(WALK_COLOURS[k % len(WALK_COLOURS)], dtype=np.uint8)
-        colours.append(np.broadcast_to(colour, (max(len(p) - 1, 0), 2, 3)))
+        each = np.broadcast_to(np.array(WALK_COLOURS[k % len(WALK_COLOURS)], dtype=np.uint8), (len(p), 3))
+        if colours_of is not None:
+            each = colours_of[k][::stride]
+        colours.append(np.stack([each[:-1], each[1:]], axis=1))
     return np.concatenate(segments).astype(np.float32), np.concatenate(colours)
 
 

@@ -21,13 +21,18 @@ _MOST_SESSIONS = 10_000
 
 @dataclass(slots=True, eq=False)
 class Session:
-    """One signed-in browser. `ended` is set when it signs out, expires or loses its key."""
+    """One signed-in browser. `ended` is set when it signs out, expires or loses its key.
 
-    id: str
+    name: what its views are filed under; not a secret, unlike the id.
+    """
+
+    id: str = field(repr=False)
     key: str = field(repr=False)
     organisation_id: str
+    scopes: frozenset[str]
     expires_at: float
     checked_at: float
+    name: str = field(default_factory=lambda: secrets.token_hex(8))
     ended: asyncio.Event = field(default_factory=asyncio.Event)
 
 
@@ -51,8 +56,9 @@ class SignedIn:
         self._drop_expired()
         now = self._clock()
         session = Session(
-            secrets.token_urlsafe(32), key, identity.organisation_id, now + self._lifetime_s, checked_at=now
-        )
+            secrets.token_urlsafe(32), key, identity.organisation_id, frozenset(identity.scopes),
+            now + self._lifetime_s, checked_at=now,
+        )  # fmt: skip
         self._sessions[session.id] = session
         return session
 

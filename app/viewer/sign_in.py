@@ -2,11 +2,13 @@
 
 import base64
 import hashlib
+from collections.abc import Mapping
 from html import escape
 
-from app.viewer.client_view import Link
+__all__ = ["LINK", "SIGN_IN_POLICY", "sign_in_html"]
 
-__all__ = ["SIGN_IN_POLICY", "sign_in_html"]
+LINK = ("building", "floor", "map", "versus", "layer", "height", "camera")
+"""What a deep link may ask for."""
 
 _STYLE = """
 :root{color-scheme:light dark;--page:#f4f6f8;--card:#fff;--ink:#1b2330;--soft:#536072;--line:#8a97a8;--act:#31688e;
@@ -40,13 +42,10 @@ SIGN_IN_POLICY = (
 )
 
 
-def sign_in_html(action: str, link: Link, wrong_key: bool = False) -> str:
+def sign_in_html(action: str, link: Mapping[str, str], wrong_key: bool = False) -> str:
     """The page, which posts the key to `action` and keeps the deep link through signing in."""
-    kept = "".join(
-        f'<input type="hidden" name="{name}" value="{escape(value)}">'
-        for name, value in (("building", link.building_id), ("floor", link.floor_id))
-        if value
-    )
+    hidden = '<input type="hidden" name="{}" value="{}">'
+    kept = "".join(hidden.format(escape(name), escape(value)) for name, value in link.items())
     told = (
         '<p class="bad" id="told" role="alert">This key is not known, was revoked, or may not read maps.</p>'
         if wrong_key

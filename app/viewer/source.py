@@ -4,14 +4,16 @@ The page never sees the database. The composition root hands it one callable (ke
 every question carries the organisation, so an answer can only ever be about that organisation's own objects.
 """
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from app.field.grid import FieldGrid
+from app.field.samples import Samples
 from app.geometry import Array
+from app.viewer.layers import StoredLayers
 
-__all__ = ["Authenticate", "Identity", "ViewedBuilding", "ViewedFloor", "ViewerSource", "Walk", "may_view"]
+__all__ = ["Authenticate", "Identity", "ViewedBuilding", "ViewedFloor", "ViewedMap", "ViewerSource", "Walk", "may_view"]
 
 
 class Identity(Protocol):
@@ -59,13 +61,29 @@ class ViewedBuilding:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ViewedMap:
+    """A finished map of a floor: its grid, and what the fit left beside it (layers (nz, ny, nx) by name)."""
+
+    floor_id: str
+    grid: FieldGrid
+    stored: StoredLayers = field(default_factory=dict)
+
+    @property
+    def nbytes(self) -> int:
+        return self.grid.nbytes + sum(layer.nbytes for layer in self.stored.values())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """One survey walk: positions (n, 3) in building metres and the field as measured (n, c) in uT."""
+    """One survey walk, thinned for the eye."""
 
     survey_id: str
     name: str
-    p_building_m: Array
-    B_uT: Array
+    samples: Samples
+
+    @property
+    def p_building_m(self) -> Array:
+        return self.samples.p_building_m
 
 
 class ViewerSource(Protocol):
@@ -75,10 +93,13 @@ class ViewerSource(Protocol):
         """Every building of the organisation, by name."""
         ...
 
-    def grid(self, organisation_id: str, map_id: str) -> FieldGrid:
-        """The grid of a map. Raises NotFound for a map that is not ready or not the organisation's."""
+    def map(self, organisation_id: str, map_id: str) -> ViewedMap:
+        """A map. Raises NotFound for one that is not ready or not the organisation's."""
         ...
 
-    def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
-        """The walks that count towards a floor's map. Raises NotFound for a floor that is not the organisation's."""
+    def walks(self, organisation_id: str, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
+        """The walks that count towards a floor's map; those in `known` (by survey id) are not read again.
+
+        Raises NotFound for a floor that is not the organisation's.
+        """
         ...

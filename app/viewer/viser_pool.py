@@ -12,15 +12,16 @@ import contextlib
 import logging
 import secrets
 import time
+from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 from starlette.concurrency import run_in_threadpool
 
-from app.viewer.client_view import ClientView, Link
-from app.viewer.content import GridCache, OrganisationContent
+from app.viewer.client_scene import ClientScene
+from app.viewer.content import OrganisationContent, RecentlyUsed
 from app.viewer.source import ViewerSource
 from app.viewer.viser_server import LOOPBACK, start_viser, stop_viser
 
@@ -30,27 +31,62 @@ if TYPE_CHECKING:
 __all__ = ["OrganisationViewer", "ViserPool"]
 
 _log = logging.getLogger(__name__)
-_GRID_BYTES = 256 * 2**20
+_RECENT_BYTES = 384 * 2**20
+_MOST_VIEWS = 1000
 
 
 @dataclass(slots=True, eq=False)
 class OrganisationViewer:
-    """The viser server of one organisation and the browsers looking at it."""
+    """The viser server of one organisation and the browsers looking at it.
+
+    scenes  the scene of each view; a view that connects again gets another, which shows what the last one showed
+    """
 
     server: ViserServer
+    content: OrganisationContent
     secret: str
     visitors: int = 0
     idle_since: float = 0.0
+    scenes: OrderedDict[str, ClientScene] = field(default_factory=OrderedDict)
 
     @property
     def http_url(self) -> str:
         return f"http://{LOOPBACK}:{self.server.get_port()}/"
 
-    def websocket_url(self, link: Link) -> str:
-        """Where the proxy connects for a browser that asked for `link`."""
-        asked = {"secret": self.secret, "building": link.building_id, "floor": link.floor_id}
-        query = urlencode({name: value for name, value in asked.items() if value})
-        return f"ws://{LOOPBACK}:{self.server.get_port()}/?{query}"
+    def websocket_url(self, view: str) -> str:
+        """Where the proxy connects for a browser's view."""
+        return f"ws://{LOOPBACK}:{self.server.get_port()}/?{urlencode({'secret': self.secret, 'view': view})}"
+
+    def welcome(self, client: ClientHandle) -> None:
+        """Give a client that came by the proxy its scene; any other sees nothing."""
+        view = self._view_of(client)
+        if view is None:
+            return
+        scene = ClientScene(client, self.content)
+        before = self.scenes.get(view)
+        self.scenes[view] = scene
+        self.scenes.move_to_end(view)
+        while len(self.scenes) > _MOST_VIEWS:
+            self.scenes.popitem(last=False)
+        if before is not None:
+            scene.resume(before)
+
+    def farewell(self, client: ClientHandle) -> None:
+        """Let go of what a client's scene holds; what it showed is remembered in case it comes back."""
+        for scene in list(self.scenes.values()):
+            if scene.belongs_to(client):
+                scene.clear()
+
+    def _view_of(self, client: ClientHandle) -> str | None:
+        """The view in the path the proxy connected with; None for a connection that did not come by the proxy."""
+        # viser 1.1 keeps no public record of a connection's request; the version is pinned and a test covers this.
+        connection = self.server._websock_server._live_connections.get(client.client_id)
+        if connection is None or connection.request is None:
+            return None
+        asked = parse_qs(urlsplit(connection.request.path).query)
+        if not secrets.compare_digest(asked.get("secret", [""])[0], self.secret):
+            return None
+        return asked.get("view", [None])[0]
 
 
 class ViserPool:
@@ -62,7 +98,7 @@ class ViserPool:
         self._source = source
         self._idle_seconds = idle_seconds
         self._clock = clock
-        self._grids = GridCache(_GRID_BYTES)
+        self._recent = RecentlyUsed(_RECENT_BYTES)
         self._viewers: dict[str, OrganisationViewer] = {}
         self._lock = asyncio.Lock()
         self._sweeper: asyncio.Task[None] | None = None
@@ -122,29 +158,15 @@ class ViserPool:
             await self.stop_idle()
 
     def _start(self, organisation_id: str) -> OrganisationViewer:
-        viewer = OrganisationViewer(start_viser(), secrets.token_urlsafe(32))
-        content = OrganisationContent(organisation_id, self._source, self._grids)
+        content = OrganisationContent(organisation_id, self._source, self._recent)
+        viewer = OrganisationViewer(start_viser(), content, secrets.token_urlsafe(32))
 
         def welcome(client: ClientHandle) -> None:
-            link = _link_of(client, viewer)
-            if link is not None:
-                try:
-                    ClientView(client, content, link)  # its controls keep it alive as long as the client
-                except Exception:
-                    _log.exception("a page could not be built for organisation %s", organisation_id)
-                    client.add_notification("This page could not be built", "The server's log says why.", color="red")
+            try:
+                viewer.welcome(client)
+            except Exception:
+                _log.exception("a scene could not be made for organisation %s", organisation_id)
 
         viewer.server.on_client_connect(welcome)
+        viewer.server.on_client_disconnect(viewer.farewell)
         return viewer
-
-
-def _link_of(client: ClientHandle, viewer: OrganisationViewer) -> Link | None:
-    """The deep link in the path the proxy connected with; None for a connection that did not come by the proxy."""
-    # viser 1.1 keeps no public record of a connection's request; the version is pinned and a test covers this.
-    connection = viewer.server._websock_server._live_connections.get(client.client_id)
-    if connection is None or connection.request is None:
-        return None
-    asked = parse_qs(urlsplit(connection.request.path).query)
-    if not secrets.compare_digest(asked.get("secret", [""])[0], viewer.secret):
-        return None
-    return Link(asked.get("building", [None])[0], asked.get("floor", [None])[0])

@@ -38,8 +38,6 @@ def start_viser() -> ViserServer:
     server.scene.world_axes.visible = False
     _light(server)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(33, 145, 140))
-    server.gui.main_panel.dock_right()
-    server.gui.set_panel_label("Isodyn")
     return server
 
 

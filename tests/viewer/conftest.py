@@ -4,7 +4,7 @@ import contextlib
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import Any, ClassVar
@@ -23,9 +23,9 @@ from websockets.typing import Origin, Subprotocol
 
 from app.errors import NotFound
 from app.field.grid import FieldGrid
-from app.field.samples import COMPONENT_NAMES, Components
+from app.field.samples import COMPONENT_NAMES, Components, Samples
 from app.viewer.page import COOKIE, ViewerApp
-from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
+from app.viewer.source import ViewedBuilding, ViewedFloor, ViewedMap, Walk
 
 
 def make_grid(
@@ -75,7 +75,8 @@ def make_walk(name: str, height_m: float = 1.2, offset_m: float = 0.0) -> Walk:
     """A walk up and down the corridor of `make_grid`."""
     s = np.linspace(0.0, 1.0, 200)
     p = np.column_stack([100.5 + 23.0 * s, 41.0 + offset_m + 0.4 * np.sin(9 * s), np.full(200, height_m)])
-    return Walk(survey_id=f"survey-{name}", name=name, p_building_m=p, B_uT=np.full((200, 3), 30.0))
+    field = make_grid(height_m=height_m).at(p).mean_uT + np.array([0.5, 0.0, 0.0])
+    return Walk(survey_id=f"survey-{name}", name=name, samples=Samples(20.0 * s, p, field, "building"))
 
 
 @dataclass
@@ -93,17 +94,22 @@ class MemorySource:
     def _floors(self, organisation_id: str) -> list[ViewedFloor]:
         return [f for b in self.buildings(organisation_id) for f in b.floors]
 
-    def grid(self, organisation_id: str, map_id: str) -> FieldGrid:
+    def map(self, organisation_id: str, map_id: str) -> ViewedMap:
+        """The maps of a floor are its active one and those named after it: map-0 and map-0-older."""
         self.asked.append((organisation_id, map_id))
-        if map_id not in {f.map_id for f in self._floors(organisation_id)}:
+        mine = {f.map_id: f.id for f in self._floors(organisation_id) if f.map_id}
+        active = map_id.removesuffix("-older")
+        if active not in mine or map_id not in self.grids:
             raise NotFound(f"no map {map_id}")
-        return self.grids[map_id]
+        grid = self.grids[map_id]
+        stored = {"coverage": np.ones(grid.measured.shape, np.float32)} if map_id == "map-0" else {}
+        return ViewedMap(mine[active], grid, stored)
 
-    def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
+    def walks(self, organisation_id: str, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
         self.asked.append((organisation_id, floor_id))
         if floor_id not in {f.id for f in self._floors(organisation_id)}:
             raise NotFound(f"no floor {floor_id}")
-        return self.walks_by_floor.get(floor_id, [])
+        return [known.get(walk.survey_id, walk) for walk in self.walks_by_floor.get(floor_id, [])]
 
 
 @pytest.fixture(scope="session")
@@ -129,7 +135,12 @@ def source() -> MemorySource:
             "north": [ViewedBuilding("tower", "Tower", (ground, first, roof)), ViewedBuilding("barn", "Barn", ())],
             "south": [ViewedBuilding("shed", "Secret shed", (shed,))],
         },
-        {"map-0": make_grid(), "map-1": make_grid(height_m=5.2, seed=2), "map-s": make_grid("level", seed=3)},
+        {
+            "map-0": make_grid(),
+            "map-0-older": make_grid(seed=4),
+            "map-1": make_grid(height_m=5.2, seed=2),
+            "map-s": make_grid("level", seed=3),
+        },
         {"floor-0": [make_walk("lobby"), make_walk("hall", offset_m=2.0)], "floor-1": [make_walk("upstairs", 5.2)]},
     )
 
@@ -184,7 +195,12 @@ class RunningViewer:
             assert answer.status_code == 303, answer.text
             return f"{COOKIE}={answer.cookies[COOKIE]}"
 
-    def websocket(self, cookie: str | None, path: str = "/view/buildings", origin: str | None = "") -> Connection:
+    def ask(self, cookie: str, what: str, view: str = "view-0001", **asked: object) -> httpx.Response:
+        """What a page asks of its scene."""
+        with self.client() as client:
+            return client.post(f"/view/scene/{view}/{what}", headers={"Cookie": cookie}, json=asked)
+
+    def websocket(self, cookie: str | None, path: str = "/view/scene/view-0001", origin: str | None = "") -> Connection:
         """A WebSocket as viser's client opens it; `origin` "" is the server's own."""
         return connect(
             f"ws://{self.host}{path}",
@@ -239,12 +255,6 @@ class Page:
 
     def labels(self) -> list[str]:
         return [m["props"]["text"] for m in self.of_type("LabelMessage")]
-
-    def control(self, label: str) -> dict[str, Any]:
-        return next(m for m in reversed(self.messages) if m.get("props", {}).get("label") == label)
-
-    def choose(self, label: str, value: object) -> None:
-        self.send({"type": "GuiUpdateMessage", "uuid": self.control(label)["uuid"], "updates": {"value": value}})
 
 
 @pytest.fixture

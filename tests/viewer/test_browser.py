@@ -52,16 +52,16 @@ def wait_for_field(page) -> None:
 
 def test_somebody_signs_in_and_sees_a_field(running, browser):
     page = new_page(browser)
-    page.goto(f"{running.url}/view/?building=tower&floor=floor-0")
+    page.goto(f"{running.url}/view/?floor=floor-0")
     page.get_by_label("API key").fill("wrong")
     page.get_by_role("button", name="Sign in").click()
     assert page.get_by_role("alert").is_visible()
     page.get_by_label("API key").fill("north-key")
     page.get_by_role("button", name="Sign in").click()
-    wait_for_field(page)
+    page.locator("#legend .legend-of").first.wait_for()
     assert page.title() == "Isodyn"
     assert page.get_by_label("Magnitude |B|, µT").is_visible()
-    assert page.get_by_text("213 m² measured, 2 walks").is_visible()
+    assert page.locator("#words").get_by_text("213 m²").is_visible()
     assert page.evaluate("document.cookie") == ""
     page.get_by_role("button", name="Sign out").click()
     page.get_by_label("API key").wait_for()
@@ -74,7 +74,7 @@ def test_the_client_connects_to_no_other_server(running, browser):
     page = new_page(browser)
     name, _, value = running.cookie("north-key").partition("=")
     page.context.add_cookies([{"name": name, "value": value, "url": f"{running.url}/view"}])
-    page.goto(f"{running.url}/view/buildings")
+    page.goto(f"{running.url}/view/scene/view-0001")
     refused = page.evaluate(
         """new Promise((tell) => {
           document.addEventListener("securitypolicyviolation", (event) => tell(event.effectiveDirective));

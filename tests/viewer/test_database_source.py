@@ -20,7 +20,7 @@ def storage(tmp_path, grid_of, walk_of):
     Base.metadata.create_all(engine)
     sessions, blobs = session_factory(engine), FolderBlobStore(tmp_path / "blobs")
     walk = walk_of("a")
-    samples = Samples(np.arange(200.0), walk.p_building_m, walk.B_uT, "building")
+    samples = Samples(np.arange(200.0), walk.p_building_m, walk.samples.B_uT, "building")
     grid_sha256, samples_sha256 = blobs.put(grid_to_bytes(grid_of())), blobs.put(samples_to_bytes(samples))
     with sessions.begin() as session:
         for organisation in ("north", "south"):
@@ -77,23 +77,25 @@ def test_a_map_that_is_not_ready_is_not_offered(storage):
         row.status, row.grid_sha256 = "running", None
     assert source.buildings("north")[0].floors[0].map_id is None
     with pytest.raises(NotFound):
-        source.grid("north", "m-north")
+        source.map("north", "m-north")
 
 
 def test_the_grid_and_the_included_walks_are_those_stored(storage, grid_of, walk_of):
     _, source = storage
-    np.testing.assert_array_equal(source.grid("north", "m-north").mean_uT, grid_of().mean_uT)
-    (walk,) = source.walks("north", "f0-north")
+    np.testing.assert_array_equal(source.map("north", "m-north").grid.mean_uT, grid_of().mean_uT)
+    assert source.map("north", "m-north").floor_id == "f0-north"
+    (walk,) = source.walks("north", "f0-north", {})
     assert (walk.survey_id, walk.name) == ("s0-north", "walk 0")
     np.testing.assert_array_equal(walk.p_building_m, walk_of("a").p_building_m)
-    assert source.walks("north", "f1-north") == []
+    assert source.walks("north", "f0-north", {walk.survey_id: walk}) == [walk]  # not read again
+    assert source.walks("north", "f1-north", {}) == []
 
 
 def test_another_organisations_objects_are_not_found(storage):
     _, source = storage
     with pytest.raises(NotFound):
-        source.grid("north", "m-south")
+        source.map("north", "m-south")
     with pytest.raises(NotFound):
-        source.walks("north", "f0-south")
+        source.walks("north", "f0-south", {})
     with pytest.raises(NotFound):
-        source.walks("north", "no-such-floor")
+        source.walks("north", "no-such-floor", {})

@@ -26,7 +26,8 @@ def test_a_stranger_is_shown_the_sign_in_page_and_nothing_else(running):
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert answer.headers["cache-control"] == "no-store"
         assert client.get("/view/session").status_code == 401
-        assert "Sign in" in client.get("/view/buildings/tower").text
+        assert client.get("/view/content").status_code == 401
+        assert client.get("/view/scene/view-0001").status_code == 401
     assert running.viewer.pool.running() == {}
 
 
@@ -47,9 +48,9 @@ def test_a_wrong_or_too_small_key_signs_nobody_in(running, key):
 
 def test_the_cookie_is_random_and_kept_from_scripts_and_other_sites(running):
     with running.client() as client:
-        answer = client.post("/view/session", data={"key": "north-key", "building": "tower"})
+        answer = client.post("/view/session", data={"key": "north-key", "floor": "floor-0", "layer": "sd", "evil": "x"})
         assert answer.status_code == 303
-        assert answer.headers["location"] == "/view/buildings/tower"
+        assert answer.headers["location"] == "/view/?floor=floor-0&layer=sd"
         header = answer.headers["set-cookie"].lower()
         assert all(flag in header for flag in ("httponly", "samesite=strict", "path=/view", "max-age=28800"))
         assert "north-key" not in header
@@ -71,24 +72,54 @@ def test_a_huge_form_is_refused(running):
         assert client.post("/view/session", data={"key": "x" * 10_000}).status_code == 413
 
 
-def test_the_page_is_visers_client_with_our_policy(running):
+def test_the_page_runs_its_own_scripts_only(running):
     cookie = {"Cookie": running.cookie("north-key")}
     with running.client() as client:
-        moved = client.get("/view/?building=tower&floor=floor-0&websocket=wss://evil.example", headers=cookie)
-        assert moved.headers["location"] == "/view/buildings/tower/floors/floor-0"  # the foreign address is gone
-        assert client.get("/view/", headers=cookie).headers["location"] == "/view/buildings"
-        page = client.get("/view/buildings/tower/floors/floor-0", headers=cookie)
+        page = client.get("/view/?floor=floor-0", headers=cookie)
         assert page.status_code == 200
-        assert "<title>Isodyn</title>" in page.text
-        assert '<div id="root"></div>' in page.text
-        assert 'action="/view/sign-out"' in page.text
-        assert "connect-src 'self'" in page.headers["content-security-policy"]
+        policy = page.headers["content-security-policy"]
+        assert "script-src 'self';" in policy
+        assert "frame-ancestors 'none'" in policy
         assert "set-cookie" not in page.headers
-        again = client.get("/view/buildings", headers={**cookie, "If-None-Match": page.headers["etag"]})
-        assert again.status_code == 304
-        plain = client.get("/view/buildings", headers={**cookie, "Accept-Encoding": "identity"})
-        assert plain.content == page.content
+        assert 'action="sign-out"' in page.text
+        for asset in ("page.js", "page.css", "server.js", "mark.svg"):
+            answer = client.get(f"/view/assets/{asset}")
+            assert answer.status_code == 200
+            again = client.get(f"/view/assets/{asset}", headers={"If-None-Match": answer.headers["etag"]})
+            assert again.status_code == 304
+        for missing in ("page.py", "..%2Fpage.py", "no.js"):
+            assert client.get(f"/view/assets/{missing}").status_code == 404
         assert client.get("/view/session", headers=cookie).status_code == 204
+
+
+def test_the_canvas_is_visers_client_with_our_policy(running):
+    cookie = {"Cookie": running.cookie("north-key")}
+    with running.client() as client:
+        moved = client.get("/view/scene/view-0001?websocket=wss://evil.example", headers=cookie)
+        assert moved.status_code == 303
+        assert moved.headers["location"] == "/view/scene/view-0001"  # the foreign address is gone
+        page = client.get("/view/scene/view-0001", headers=cookie)
+        assert page.status_code == 200
+        assert '<div id="root"></div>' in page.text
+        assert "connect-src 'self'" in page.headers["content-security-policy"]
+        assert "frame-ancestors 'self'" in page.headers["content-security-policy"]
+        again = client.get("/view/scene/view-0002", headers={**cookie, "If-None-Match": page.headers["etag"]})
+        assert again.status_code == 304
+        plain = client.get("/view/scene/view-0001", headers={**cookie, "Accept-Encoding": "identity"})
+        assert plain.content == page.content
+        assert client.get("/view/scene/x", headers=cookie).status_code == 404
+
+
+def test_the_pickers_offer_ones_own_buildings_and_say_what_the_key_may(running):
+    with running.client() as client:
+        north, south = (
+            client.get("/view/content", headers={"Cookie": running.cookie(key)}).json()
+            for key in ("north-key", "south-key")
+        )
+    assert [b["name"] for b in north["buildings"]] == ["Tower", "Barn"]
+    assert north["scopes"] == ["map:read"]
+    assert north["buildings"][0]["floors"][0] == {"id": "floor-0", "name": "Ground", "ordinal": 0, "map_id": "map-0"}
+    assert [b["name"] for b in south["buildings"]] == ["Secret shed"]
 
 
 def test_signing_out_makes_the_cookie_worthless(running):
@@ -117,7 +148,7 @@ def test_a_session_expires_and_a_revoked_key_loses_the_page(serve, keys, source)
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs Linux's table of sockets")
 def test_viser_listens_on_loopback_only(running):
     with running.client() as client:
-        client.get("/view/buildings", headers={"Cookie": running.cookie("north-key")})
+        client.get("/view/scene/view-0001", headers={"Cookie": running.cookie("north-key")})
     (viewer,) = running.viewer.pool.running().values()
     port = viewer.server.get_port()
     tables = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
@@ -131,13 +162,13 @@ def test_viser_listens_on_loopback_only(running):
 def test_a_servers_life_ends_when_nobody_has_looked_for_a_while(serve, keys, source):
     running = serve(ViewerApp(keys, source, idle_seconds=0.2))
     with running.client() as client:
-        client.get("/view/buildings", headers={"Cookie": running.cookie("north-key")})
+        client.get("/view/scene/view-0001", headers={"Cookie": running.cookie("north-key")})
     (viewer,) = running.viewer.pool.running().values()
     thread = viewer.server._websock_server._server_thread
     thread.join(timeout=10)
     assert not thread.is_alive()
     with running.client() as client:  # and begins again with the next visitor
-        assert client.get("/view/buildings", headers={"Cookie": running.cookie("north-key")}).status_code == 200
+        assert client.get("/view/scene/view-0001", headers={"Cookie": running.cookie("north-key")}).status_code == 200
 
 
 def test_viser_and_matplotlib_are_loaded_by_the_first_visit_only():

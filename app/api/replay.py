@@ -1,0 +1,110 @@
+"""Replay a walk against a floor's map: window after window, beside where it was. Nothing is stored."""
+
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, Field
+
+from app.api.auth import Locating
+from app.api.body import read_upload
+from app.api.context import ContextDep
+from app.api.models import Finite, Id
+from app.api.problems import ERROR_RESPONSES
+from app.api.surveys import SURVEY_FILES, SurveyFormat
+from app.errors import Conflict
+from app.positioning.locate import SearchableFloor
+from app.services.locate_window import active_maps
+from app.services.replay_walk import Replay, ReplayedFix, replay_walk
+from app.survey.read import read_survey
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["locate"], responses=ERROR_RESPONSES)
+
+
+class ReplayedPath(BaseModel):
+    """The first line: the path that was walked, thinned, and how many windows follow."""
+
+    kind: Literal["path"] = "path"
+    floor_id: str
+    path_m: list[list[float]]
+    windows: int
+
+
+class ReplayedWindow(BaseModel):
+    """One line a window: what was answered, of its last sample, and how far that is from where it was."""
+
+    kind: Literal["window"] = "window"
+    t_s: float
+    truth_m: list[float]
+    status: Literal["fix", "ambiguous", "inconsistent", "unmapped"]
+    reason: str | None
+    position_m: list[float] | None
+    covariance_m2: list[list[float]] | None
+    radius_95_m: float | None
+    probability: Annotated[float | None, Field(description="of the strongest mode")]
+    error_m: Annotated[float | None, Field(description="of the position, along the floor")]
+
+
+@router.post(
+    "/floors/{floor_id}/replay",
+    summary="Replay a walk against the floor's map",
+    response_class=StreamingResponse,
+    openapi_extra={"requestBody": SURVEY_FILES},
+    responses={200: {"description": "JSON lines: a path, then a line a window as it is answered",
+                     "content": {"application/x-ndjson": {"schema": {"type": "string"}}}}},
+)  # fmt: skip
+async def replay(
+    floor_id: Id,
+    request: Request,
+    context: ContextDep,
+    identity: Locating,
+    format: Annotated[SurveyFormat, Query(description="what the bytes are")] = "csv",
+    frame: Annotated[
+        Literal["building", "level", "norm"], Query(description="what b is when there is no quaternion")
+    ] = "building",
+    window_m: Annotated[Finite, Query(ge=1, le=200, description="length of a window, walked")] = 10.0,
+    every_m: Annotated[Finite, Query(ge=0.2, le=200, description="from one window to the next")] = 2.0,
+) -> StreamingResponse:
+    """The walk is read as a survey would be and never stored. Windows are asked without a prior, on this floor."""
+    data = await read_upload(request, context.settings.max_upload_bytes)
+
+    def begin() -> Replay:
+        with context.engine.connect() as connection:
+            maps = active_maps(connection, identity.organisation_id, floor_ids=[floor_id])
+        if not maps:
+            raise Conflict(f"floor {floor_id} has no map yet; upload surveys and wait for its job")
+        floors: list[SearchableFloor] = context.grids.searchable([(m.floor_id, m.grid_sha256) for m in maps])
+        return replay_walk(read_survey(data, format=format, frame=frame), floors, window_m, every_m)
+
+    begun = await run_in_threadpool(begin)
+    return StreamingResponse(_lines(floor_id, begun), media_type="application/x-ndjson")
+
+
+def _lines(floor_id: str, begun: Replay) -> Iterator[str]:
+    stride = -(-len(begun.path_m) // 2000)
+    yield _line(ReplayedPath(floor_id=floor_id, path_m=begun.path_m[::stride].tolist(), windows=begun.windows))
+    for fix in begun.fixes:
+        yield _line(_shown(fix))
+
+
+def _shown(replayed: ReplayedFix) -> ReplayedWindow:
+    posterior = replayed.fix.posterior
+    told: dict[str, Any] = dict.fromkeys(("position_m", "covariance_m2", "radius_95_m", "probability"))
+    if posterior is not None:
+        told = {
+            "position_m": list(posterior.position_m), "covariance_m2": posterior.covariance_m2.tolist(),
+            "radius_95_m": posterior.radius_95_m,
+            "probability": max((mode.probability for mode in posterior.modes), default=None),
+        }  # fmt: skip
+    return ReplayedWindow(
+        t_s=replayed.t_s, truth_m=replayed.truth_m.tolist(), status=replayed.fix.status, reason=replayed.fix.reason,
+        error_m=replayed.error_m, **told,
+    )  # fmt: skip
+
+
+def _line(model: BaseModel) -> str:
+    return model.model_dump_json() + "\n"
