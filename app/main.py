@@ -13,7 +13,7 @@ from fastapi.responses import RedirectResponse
 from threadpoolctl import threadpool_limits
 
 from app import __version__
-from app.api import buildings, health, jobs, localizability, locate, maps, surveys
+from app.api import buildings, floors, health, jobs, localizability, locate, maps, outlines, plans, surveys
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.metrics import Metrics, MetricsMiddleware
@@ -89,7 +89,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
-    for part in (locate, health, buildings, surveys, maps, localizability, jobs):
+    for part in (locate, health, buildings, floors, outlines, plans, surveys, maps, localizability, jobs):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)
@@ -117,7 +117,7 @@ def _to_the_page() -> RedirectResponse:
 
 
 def _is_upload(path: str) -> bool:
-    return path.startswith("/v1/floors/") and path.endswith("/surveys")
+    return path.startswith("/v1/floors/") and path.endswith(("/surveys", "/plan"))
 
 
 def _describe_problems(app: FastAPI) -> None:

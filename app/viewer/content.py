@@ -47,3 +47,6 @@ class OrganisationContent:
 
     def walks(self, floor_id: str) -> list[Walk]:
         return self._source.walks(self._organisation_id, floor_id)
+
+    def plan_image(self, floor_id: str) -> bytes:
+        return self._source.plan_image(self._organisation_id, floor_id)

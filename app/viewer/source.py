@@ -11,7 +11,16 @@ from typing import Protocol
 from app.field.grid import FieldGrid
 from app.geometry import Array
 
-__all__ = ["Authenticate", "Identity", "ViewedBuilding", "ViewedFloor", "ViewerSource", "Walk", "may_view"]
+__all__ = [
+    "Authenticate",
+    "Identity",
+    "PlacedPlan",
+    "ViewedBuilding",
+    "ViewedFloor",
+    "ViewerSource",
+    "Walk",
+    "may_view",
+]
 
 
 class Identity(Protocol):
@@ -33,11 +42,24 @@ def may_view(identity: Identity) -> bool:
     return "map:read" in identity.scopes or "admin" in identity.scopes
 
 
+@dataclass(frozen=True, slots=True)
+class PlacedPlan:
+    """A picture of a floor and where it lies: its sides in m, building x, y of its lower left corner in m, and the
+    direction of its lower side in rad, counter-clockwise from the building's x. The picture stays under its hash."""
+
+    sha256: str
+    width_m: float
+    height_m: float
+    x_m: float
+    y_m: float
+    bearing_rad: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewedFloor:
     """A floor as the page needs it. `rings_m`: outline, each (k, 2) in building metres, closed; () when unknown.
 
-    map_id, grid_sha256 are None while the floor has no active map.
+    map_id, grid_sha256 are None while the floor has no active map, `plan` while it has no picture.
     """
 
     id: str
@@ -47,6 +69,7 @@ class ViewedFloor:
     rings_m: tuple[Array, ...] = ()
     map_id: str | None = None
     grid_sha256: str | None = None
+    plan: PlacedPlan | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,4 +104,9 @@ class ViewerSource(Protocol):
 
     def walks(self, organisation_id: str, floor_id: str) -> list[Walk]:
         """The walks that count towards a floor's map. Raises NotFound for a floor that is not the organisation's."""
+        ...
+
+    def plan_image(self, organisation_id: str, floor_id: str) -> bytes:
+        """The picture of a floor's plan, PNG or WebP. Raises NotFound for a floor that has none or is not the
+        organisation's."""
         ...
