@@ -13,7 +13,7 @@ from fastapi.responses import RedirectResponse
 from threadpoolctl import threadpool_limits
 
 from app import __version__
-from app.api import buildings, health, jobs, localizability, locate, maps, replay, surveys
+from app.api import buildings, floors, health, jobs, localizability, locate, maps, outlines, plans, replay, surveys
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.metrics import Metrics, MetricsMiddleware
@@ -88,7 +88,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
-    for part in (locate, health, buildings, surveys, maps, localizability, replay, jobs):
+    for part in (locate, health, buildings, floors, outlines, plans, surveys, maps, localizability, replay, jobs):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)
@@ -118,7 +118,8 @@ def _to_the_page() -> RedirectResponse:
 
 def _is_upload(path: str) -> bool:
     """Whether an upload comes here, straight or by the page."""
-    return path.removeprefix("/view").startswith("/v1/floors/") and path.endswith(("/surveys", "/replay"))
+    path = path.removeprefix("/view")
+    return path.startswith("/v1/floors/") and path.endswith(("/surveys", "/plan", "/replay"))
 
 
 def _describe_problems(app: FastAPI) -> None:

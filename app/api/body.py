@@ -1,4 +1,4 @@
-"""Request bodies under a limit: JSON bodies by a middleware, survey files as they stream in, decompressed."""
+"""Request bodies under a limit: JSON bodies by a middleware, surveys and plans as they stream in, decompressed."""
 
 import zlib
 from collections.abc import AsyncIterator, Callable
@@ -117,7 +117,7 @@ async def _collect(chunks: AsyncIterator[bytes], max_bytes: int) -> bytes:
 
 def _check(size: int, max_bytes: int) -> None:
     if size > max_bytes:
-        raise TooLarge(f"the survey unpacks to more than {max_bytes:,} bytes; split it into several walks")
+        raise TooLarge(f"the body unpacks to more than {max_bytes:,} bytes; split a survey into several walks")
 
 
 def _damaged(encoding: str, why: str) -> InvalidInput:

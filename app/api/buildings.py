@@ -1,10 +1,11 @@
-"""Buildings and their floors."""
+"""Buildings: make, list, change."""
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Request, Response
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.config import JsonDict
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -13,12 +14,12 @@ from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.listing import Page, PagingDep, list_page
-from app.api.models import Finite, Id, Metres, Name, RequestModel
+from app.api.models import Finite, Id, Name, RequestModel, unchanged
 from app.api.problems import ERROR_RESPONSES
-from app.db.tables import Building, Floor
+from app.db.tables import Building
 from app.errors import NotFound
 
-__all__ = ["find_building", "find_floor", "router"]
+__all__ = ["find_building", "router"]
 
 router = APIRouter(prefix="/v1", tags=["buildings"], responses=ERROR_RESPONSES)
 
@@ -38,6 +39,15 @@ class NewBuilding(RequestModel):
     anchor: Anchor | None = None
 
 
+ANCHOR: JsonDict = {"latitude_deg": 48.1403, "longitude_deg": 11.5583, "height_m": 570.0, "bearing_deg": 82.5}
+
+
+class BuildingPatch(RequestModel):
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"anchor": ANCHOR}]})
+    name: Name = unchanged()
+    anchor: Annotated[Anchor | None, Field(description="null removes it")] = unchanged()
+
+
 class BuildingView(BaseModel):
     id: str
     name: str
@@ -45,55 +55,8 @@ class BuildingView(BaseModel):
     created_at: datetime
 
 
-def _closed(rings: list[list[list[float]]]) -> list[list[list[float]]]:
-    for ring in rings:
-        if ring[0] != ring[-1]:
-            raise ValueError("a ring's last point must repeat its first")
-    return rings
-
-
-Coordinate = Annotated[list[Metres], Field(min_length=2, max_length=3)]
-Ring = Annotated[list[Coordinate], Field(min_length=4, max_length=10_000)]
-
-
-class Outline(RequestModel):
-    """A GeoJSON Polygon in building metres."""
-
-    type: Literal["Polygon"]
-    coordinates: Annotated[list[Ring], Field(min_length=1, max_length=100), AfterValidator(_closed)]
-
-
-class NewFloor(RequestModel):
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"name": "Ground floor", "ordinal": 0, "elevation_m": 0.0}]}
-    )
-    name: Name
-    ordinal: Annotated[int, Field(ge=-1000, le=1000, description="0 is the ground floor")]
-    elevation_m: Annotated[Metres, Field(description="z of the slab in the building frame")] = 0.0
-    height_m: Annotated[Finite, Field(gt=0, le=1000)] | None = None
-    outline: Outline | None = None
-    auto_build: Annotated[bool, Field(description="rebuild the map after every change of surveys")] = True
-
-
-class FloorView(BaseModel):
-    id: str
-    building_id: str
-    name: str
-    ordinal: int
-    elevation_m: float
-    height_m: float | None
-    outline: dict[str, Any] | None
-    auto_build: bool
-    active_map_id: str | None
-    created_at: datetime
-
-
 def show_building(row: Building) -> BuildingView:
     return BuildingView.model_validate(row, from_attributes=True)
-
-
-def show_floor(row: Floor) -> FloorView:
-    return FloorView.model_validate(row, from_attributes=True)
 
 
 def find_building(session: Session, identity: Identity, building_id: str) -> Building:
@@ -101,14 +64,6 @@ def find_building(session: Session, identity: Identity, building_id: str) -> Bui
     row = session.get(Building, building_id)
     if row is None or row.organisation_id != identity.organisation_id:
         raise NotFound(f"no building {building_id}")
-    return row
-
-
-def find_floor(session: Session, identity: Identity, floor_id: str) -> Floor:
-    """The organisation's floor. Raises NotFound."""
-    row = session.get(Floor, floor_id)
-    if row is None or row.organisation_id != identity.organisation_id:
-        raise NotFound(f"no floor {floor_id}")
     return row
 
 
@@ -139,31 +94,13 @@ def get_building(building_id: Id, request: Request, context: ContextDep, identit
         return pointer(request, show_building(find_building(session, identity, building_id)))
 
 
-@router.post("/buildings/{building_id}/floors", status_code=201, response_model=FloorView, summary="Add a floor")
-def create_floor(
-    building_id: Id, body: NewFloor, request: Request, context: ContextDep, identity: MapWriting,
-    key: IdempotencyKey = None,
-) -> Response:  # fmt: skip
-    def create(session: Session) -> tuple[int, BaseModel]:
-        building = find_building(session, identity, building_id)
-        row = Floor(organisation_id=identity.organisation_id, building_id=building.id,
-                    **body.model_dump(exclude={"outline"}),
-                    outline=body.outline.model_dump() if body.outline else None)  # fmt: skip
-        session.add(row)
+@router.patch("/buildings/{building_id}", summary="Change a building's name or anchor")
+def patch_building(building_id: Id, body: BuildingPatch, context: ContextDep, identity: MapWriting) -> BuildingView:
+    """What is not given stays. Outlines that came as longitude and latitude were put into building metres by the anchor
+    of that time, and do not move with a new one: send them again."""
+    with context.transaction() as session:
+        row = find_building(session, identity, building_id)
+        for name, value in body.model_dump(exclude_unset=True).items():
+            setattr(row, name, value)
         session.flush()
-        return 201, show_floor(row)
-
-    return answer_once(context, identity, request, key, body.model_dump_json().encode(), create)
-
-
-@router.get("/buildings/{building_id}/floors", summary="List a building's floors")
-def list_floors(building_id: Id, context: ContextDep, identity: Reading, paging: PagingDep) -> Page[FloorView]:
-    with context.transaction() as session:
-        find_building(session, identity, building_id)
-        return list_page(session, select(Floor).where(Floor.building_id == building_id), Floor.id, paging, show_floor)
-
-
-@router.get("/floors/{floor_id}", response_model=FloorView, summary="One floor, and the map it answers with")
-def get_floor(floor_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
-    with context.transaction() as session:
-        return pointer(request, show_floor(find_floor(session, identity, floor_id)))
+        return show_building(row)

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Annotated
 
-from fastapi import Header, Request
+from fastapi import Depends, Header, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from sqlalchemy.exc import IntegrityError
@@ -16,7 +16,7 @@ from app.db.tables import Idempotency
 from app.errors import Conflict
 from app.services.manage_keys import Identity
 
-__all__ = ["IdempotencyKey", "answer_once"]
+__all__ = ["IdempotencyKey", "RawBody", "answer_once"]
 
 IdempotencyKey = Annotated[
     str | None,
@@ -28,6 +28,15 @@ IdempotencyKey = Annotated[
         description="repeat a request safely: the same key gives the first answer again",
     ),
 ]
+
+
+async def _raw_body(request: Request) -> bytes:
+    return await request.body()
+
+
+RawBody = Annotated[bytes, Depends(_raw_body)]
+"""The bytes of a JSON body, for bodies that hold JSON of any shape, which need not be fit to be written again."""
+
 Create = Callable[[Session], tuple[int, BaseModel]]
 
 

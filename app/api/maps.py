@@ -1,5 +1,6 @@
 """Maps: ask for one, look at it, ask it for the field, take it away as a file or a picture."""
 
+import json
 from datetime import datetime
 from hashlib import sha256 as sha256_of
 from itertools import pairwise
@@ -14,9 +15,9 @@ from sqlalchemy.orm import Session
 
 from app import __version__
 from app.api.auth import Identity, MapWriting, Reading
-from app.api.buildings import find_floor
 from app.api.caching import immutable, pointer
 from app.api.context import Context, ContextDep
+from app.api.floors import find_floor
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
@@ -388,7 +389,8 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
         rings, title = rings_of_polygon(floor.outline), f"{floor.name}: magnetic map"
         return static_view_html(grid, walks, title, rings, floor.elevation_m).encode()
 
-    shown = sha256_of(" ".join([sha256, *(survey.id for survey in surveys)]).encode()).hexdigest()
+    drawn = [sha256, *(survey.id for survey in surveys), floor.name, floor.elevation_m, floor.outline]
+    shown = sha256_of(json.dumps(drawn).encode()).hexdigest()
     return immutable(request, shown, page, "text/html")
 
 

@@ -1,11 +1,11 @@
 """Field types that requests and responses share: bounded, finite, free of control characters."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-__all__ = ["Finite", "Id", "Metres", "Name", "Point", "RequestModel"]
+__all__ = ["Finite", "Id", "Metres", "Name", "Point", "RequestModel", "unchanged"]
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
@@ -18,3 +18,11 @@ class RequestModel(BaseModel):
     """A request body: unknown names are refused, so that a misspelt option is never silently ignored."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+def unchanged() -> Any:
+    """The default of a PATCH's field: what is not given stays. A null is another thing, and refused unless typed so.
+
+    Read such bodies by `model_dump(exclude_unset=True)`.
+    """
+    return Field(default_factory=lambda: None)

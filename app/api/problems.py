@@ -134,7 +134,7 @@ async def _isodyn_error(_: Request, error: Exception) -> JSONResponse:
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    not_json = "application/json" not in request.headers.get("content-type", "application/json")
+    not_json = "json" not in request.headers.get("content-type", "application/json")
     faults = [_fault(each["loc"], each["msg"], not_json) for each in error.errors()]
     detail = f"{faults[0].location}: {faults[0].reason}" if faults else "the request does not fit its description"
     return problem_response(422, "invalid-input", "The request cannot be used", detail, faults[:50])

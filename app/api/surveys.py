@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, SurveyReading, SurveyWriting
 from app.api.body import read_upload
-from app.api.buildings import find_floor
 from app.api.context import Context, ContextDep
+from app.api.floors import find_floor
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page

@@ -102,7 +102,7 @@ class Building(Base):
 class Floor(Base):
     """`claimed_generation` names rebuilds (docs/decisions/0003); `build_sequence` orders builds as they start;
     `active_sequence` is the sequence of the build that `active_map_id` points to, so an older build never replaces a
-    newer one."""
+    newer one. `plan` is a picture in the blob store and where it lies (`app.services.receive_plan.Plan`)."""
 
     __tablename__ = "floor"
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
@@ -113,6 +113,7 @@ class Floor(Base):
     elevation_m: Mapped[float]
     height_m: Mapped[float | None]
     outline: Mapped[dict[str, Any] | None]
+    plan: Mapped[dict[str, Any] | None]
     auto_build: Mapped[bool] = mapped_column(default=True)
     claimed_generation: Mapped[int] = mapped_column(default=0)
     build_sequence: Mapped[int] = mapped_column(default=0)

@@ -36,6 +36,7 @@ class ParsedSurvey:
     sample_count: int
     report: dict[str, object]
     session: str | None
+    elevation_m: float
 
 
 def parse_survey(
@@ -60,6 +61,7 @@ def parse_survey(
         sample_count=len(samples),
         report=walk.report,
         session=session,
+        elevation_m=elevation_m,
     )
 
 
@@ -74,6 +76,9 @@ def record_survey(
     Raises NotFound, InvalidInput (`find_replaced`), Conflict.
     """
     lock_floor(session, floor.id)
+    session.refresh(floor, ["elevation_m"])
+    if floor.elevation_m != parsed.elevation_m:
+        raise Conflict("the floor's elevation was changed while the survey was read; send it again")
     same = _same_survey(session, floor.id, parsed, replaces)
     if same is not None and replaces in (None, same.id, same.report.get("replaces")):
         _check_session(same, parsed)

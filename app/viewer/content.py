@@ -119,3 +119,7 @@ class OrganisationContent:
         walks = self._source.walks(self._organisation_id, floor_id, known.by_survey if known else {})
         self._recent.put(key, _Walks({walk.survey_id: walk for walk in walks}))
         return walks
+
+    def plan_image(self, floor_id: str) -> bytes:
+        """Raises NotFound."""
+        return self._source.plan_image(self._organisation_id, floor_id)

@@ -13,7 +13,7 @@ from app.errors import NotFound
 from app.field.samples import Samples
 from app.geometry import Array
 from app.services.artefacts import grid_from_bytes, layers_from_bytes, samples_from_bytes
-from app.viewer.source import ViewedBuilding, ViewedFloor, ViewedMap, Walk
+from app.viewer.source import PlacedPlan, ViewedBuilding, ViewedFloor, ViewedMap, Walk
 
 __all__ = ["DatabaseViewerSource", "rings_of_polygon"]
 
@@ -60,9 +60,7 @@ class DatabaseViewerSource:
     def walks(self, organisation_id: str, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
         """The included surveys of a floor in order of arrival. Raises NotFound, CorruptArtefact."""
         with self._sessions() as session:
-            floor = session.get(Floor, floor_id)
-            if floor is None or floor.organisation_id != organisation_id:
-                raise NotFound(f"no floor {floor_id}; `GET /v1/buildings` shows what there is")
+            _find_floor(session, organisation_id, floor_id)
             rows = session.execute(
                 select(Survey.id, Survey.name, Survey.samples_sha256)
                 .where(Survey.floor_id == floor_id, Survey.included)
@@ -70,11 +68,26 @@ class DatabaseViewerSource:
             ).all()
         return [known.get(row[0]) or self._walk(*row) for row in rows]
 
+    def plan_image(self, organisation_id: str, floor_id: str) -> bytes:
+        """The picture of a floor's plan. Raises NotFound, CorruptArtefact."""
+        with self._sessions() as session:
+            plan = _find_floor(session, organisation_id, floor_id).plan
+        if plan is None:
+            raise NotFound(f"floor {floor_id} has no plan; `PUT /v1/floors/{floor_id}/plan` gives it one")
+        return self._blobs.get(plan["sha256"])
+
     def _walk(self, survey_id: str, name: str, samples_sha256: str) -> Walk:
         samples = samples_from_bytes(self._blobs.get(samples_sha256))
         kept = slice(None, None, -(-len(samples) // _MOST_SAMPLES))
         thinned = Samples(samples.t_s[kept], samples.p_building_m[kept], samples.B_uT[kept], samples.frame)
         return Walk(survey_id, name, thinned)
+
+
+def _find_floor(session: Session, organisation_id: str, floor_id: str) -> Floor:
+    floor = session.get(Floor, floor_id)
+    if floor is None or floor.organisation_id != organisation_id:
+        raise NotFound(f"no floor {floor_id}; `GET /v1/buildings` shows what there is")
+    return floor
 
 
 def _viewed(floor: Floor, grid_sha256: str | None) -> ViewedFloor:
@@ -86,11 +99,17 @@ def _viewed(floor: Floor, grid_sha256: str | None) -> ViewedFloor:
         rings_m=rings_of_polygon(floor.outline),
         map_id=floor.active_map_id if grid_sha256 is not None else None,
         grid_sha256=grid_sha256,
+        plan=_placed(floor.plan),
     )
 
 
+def _placed(plan: dict[str, Any] | None) -> PlacedPlan | None:
+    return None if plan is None else PlacedPlan(**{name: plan[name] for name in PlacedPlan.__dataclass_fields__})
+
+
 def rings_of_polygon(outline: dict[str, Any] | None) -> tuple[Array, ...]:
-    """The rings (k, 2) of a GeoJSON Polygon in building metres; () for None."""
+    """The rings (k, 2) of a GeoJSON Polygon, or of every polygon of a MultiPolygon, in building metres; () for None."""
     if outline is None:
         return ()
-    return tuple(np.asarray(ring, dtype=np.float64)[:, :2] for ring in outline["coordinates"])
+    polygons = outline["coordinates"] if outline["type"] == "MultiPolygon" else [outline["coordinates"]]
+    return tuple(np.asarray(ring, dtype=np.float64)[:, :2] for rings in polygons for ring in rings)

@@ -13,7 +13,17 @@ from app.field.samples import Samples
 from app.geometry import Array
 from app.viewer.layers import StoredLayers
 
-__all__ = ["Authenticate", "Identity", "ViewedBuilding", "ViewedFloor", "ViewedMap", "ViewerSource", "Walk", "may_view"]
+__all__ = [
+    "Authenticate",
+    "Identity",
+    "PlacedPlan",
+    "ViewedBuilding",
+    "ViewedFloor",
+    "ViewedMap",
+    "ViewerSource",
+    "Walk",
+    "may_view",
+]
 
 
 class Identity(Protocol):
@@ -35,11 +45,24 @@ def may_view(identity: Identity) -> bool:
     return "map:read" in identity.scopes or "admin" in identity.scopes
 
 
+@dataclass(frozen=True, slots=True)
+class PlacedPlan:
+    """A picture of a floor and where it lies: its sides in m, building x, y of its lower left corner in m, and the
+    direction of its lower side in rad, counter-clockwise from the building's x. The picture stays under its hash."""
+
+    sha256: str
+    width_m: float
+    height_m: float
+    x_m: float
+    y_m: float
+    bearing_rad: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewedFloor:
     """A floor as the page needs it. `rings_m`: outline, each (k, 2) in building metres, closed; () when unknown.
 
-    map_id, grid_sha256 are None while the floor has no active map.
+    map_id, grid_sha256 are None while the floor has no active map, `plan` while it has no picture.
     """
 
     id: str
@@ -49,6 +72,7 @@ class ViewedFloor:
     rings_m: tuple[Array, ...] = ()
     map_id: str | None = None
     grid_sha256: str | None = None
+    plan: PlacedPlan | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,4 +126,9 @@ class ViewerSource(Protocol):
 
         Raises NotFound for a floor that is not the organisation's.
         """
+        ...
+
+    def plan_image(self, organisation_id: str, floor_id: str) -> bytes:
+        """The picture of a floor's plan, PNG or WebP. Raises NotFound for a floor that has none or is not the
+        organisation's."""
         ...

@@ -8,14 +8,22 @@ import pytest
 from fastapi.routing import APIRoute
 
 OPEN = {"/healthz", "/readyz"}
+OUTLINE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 5], [0, 5], [0, 0]]]}
 BODIES: dict[str, Any] = {
     "/v1/buildings/{building_id}/floors": {"name": "x", "ordinal": 1},
     "/v1/floors/{floor_id}/maps": {},
     "/v1/maps/{map_id}/field": {"points_m": [[0, 0, 0]]},
     "/v1/surveys/{survey_id}": {"included": True},
+    "/v1/floors/{floor_id}/outline": OUTLINE,
+    "/v1/buildings/{building_id}/floors:import": {"type": "FeatureCollection", "features": []},
+    "/v1/buildings/{building_id}": {},
+    "/v1/floors/{floor_id}": {},
 }
 WINDOW = {"window": {"frame": "norm", "b_ut": [50.0], "displacement_m": [[0, 0, 0]]}}
-QUERIES = {"/v1/maps/{map_id}/export": {"format": "csv"}}
+QUERIES = {
+    "/v1/maps/{map_id}/export": {"format": "csv"},
+    "/v1/floors/{floor_id}/plan": {"metres_per_pixel": "0.1"},
+}
 
 
 def _routes(app: Any) -> list[tuple[str, str]]:
@@ -41,7 +49,7 @@ def _call(http: Any, method: str, path: str, ids: dict[str, str], headers: dict[
     arguments: dict[str, Any] = {"headers": headers, "params": QUERIES.get(path)}
     if path.endswith("/surveys") and method == "POST":
         arguments["content"] = b"t_s\n"
-    elif method in ("POST", "PATCH"):
+    elif method in ("POST", "PATCH", "PUT"):
         body = {"queries": [WINDOW]} if path.endswith(":batch") else WINDOW if path.endswith("locate") else None
         arguments["json"] = BODIES.get(path, body)
     return http.request(method, url, **arguments)

@@ -87,6 +87,7 @@ class MemorySource:
     grids: dict[str, FieldGrid]
     walks_by_floor: dict[str, list[Walk]]
     asked: list[tuple[str, str]] = field(default_factory=list)
+    plans: dict[str, bytes] = field(default_factory=dict)
 
     def buildings(self, organisation_id: str) -> list[ViewedBuilding]:
         return self.by_organisation.get(organisation_id, [])
@@ -110,6 +111,12 @@ class MemorySource:
         if floor_id not in {f.id for f in self._floors(organisation_id)}:
             raise NotFound(f"no floor {floor_id}")
         return [known.get(walk.survey_id, walk) for walk in self.walks_by_floor.get(floor_id, [])]
+
+    def plan_image(self, organisation_id: str, floor_id: str) -> bytes:
+        self.asked.append((organisation_id, floor_id))
+        if floor_id not in {f.id for f in self._floors(organisation_id) if f.plan is not None}:
+            raise NotFound(f"no plan of floor {floor_id}")
+        return self.plans[floor_id]
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,7 @@
 """The viewer's source on a real database and a real blob store."""
 
+from hashlib import sha256
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,14 @@ from app.db.tables import Base, Building, Floor, Map, Organisation, Survey
 from app.errors import NotFound
 from app.field.samples import Samples
 from app.services.artefacts import grid_to_bytes, samples_to_bytes
-from app.viewer.database_source import DatabaseViewerSource
+from app.viewer.content import OrganisationContent, RecentlyUsed
+from app.viewer.database_source import DatabaseViewerSource, rings_of_polygon
+from app.viewer.source import PlacedPlan
 
+PLAN = {
+    "media_type": "image/png", "width_px": 300, "height_px": 200, "metres_per_pixel": 0.03, "width_m": 9.0,
+    "height_m": 6.0, "x_m": -1.0, "y_m": 2.0, "bearing_rad": 0.5,
+}  # fmt: skip
 OUTLINE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 5], [0, 5], [0, 0]]]}
 
 
@@ -22,6 +30,7 @@ def storage(tmp_path, grid_of, walk_of):
     walk = walk_of("a")
     samples = Samples(np.arange(200.0), walk.p_building_m, walk.samples.B_uT, "building")
     grid_sha256, samples_sha256 = blobs.put(grid_to_bytes(grid_of())), blobs.put(samples_to_bytes(samples))
+    plan_sha256 = blobs.put(b"a picture")
     with sessions.begin() as session:
         for organisation in ("north", "south"):
             session.add(Organisation(id=organisation, name=organisation))
@@ -34,6 +43,7 @@ def storage(tmp_path, grid_of, walk_of):
                         id=f"f{ordinal}-{organisation}", organisation_id=organisation,
                         building_id=f"b-{organisation}", name=name, ordinal=ordinal, elevation_m=4.0 * ordinal,
                         outline=OUTLINE if ordinal == 0 else None,
+                        plan=PLAN | {"sha256": plan_sha256} if ordinal == 0 else None,
                         active_map_id=f"m-{organisation}" if ordinal == 0 else None,
                     )
                 )  # fmt: skip
@@ -99,3 +109,23 @@ def test_another_organisations_objects_are_not_found(storage):
         source.walks("north", "f0-south", {})
     with pytest.raises(NotFound):
         source.walks("north", "no-such-floor", {})
+    with pytest.raises(NotFound):
+        source.plan_image("north", "f0-south")
+
+
+def test_a_floor_has_its_plan_and_where_it_lies(storage):
+    _, source = storage
+    ground, first = source.buildings("north")[0].floors
+    assert ground.plan == PlacedPlan(sha256(b"a picture").hexdigest(), 9.0, 6.0, -1.0, 2.0, 0.5)
+    assert first.plan is None
+    content = OrganisationContent("north", source, RecentlyUsed(1))
+    assert content.plan_image(ground.id) == b"a picture"
+    for floor in (first.id, "f0-south"):
+        with pytest.raises(NotFound):
+            content.plan_image(floor)
+
+
+def test_every_ring_of_every_polygon_is_drawn():
+    rings = [[[0, 0], [9, 0], [9, 5], [0, 0]], [[1, 1], [2, 1], [2, 2], [1, 1]], [[20, 0], [29, 0], [29, 5], [20, 0]]]
+    outline = {"type": "MultiPolygon", "coordinates": [rings[:2], rings[2:]]}
+    assert [ring.tolist() for ring in rings_of_polygon(outline)] == rings
