@@ -18,6 +18,12 @@ _GROUPS = {
     "Confidence": ("sd", "coverage", "conflict", "measured"),
     "Telling places apart": ("gradient", "gradient_x", "gradient_y", "information", "expected_error"),
 }
+_SHORT = {
+    "gradient": "Gradient",
+    "gradient_x": "Gradient along x",
+    "gradient_y": "Gradient along y",
+    "expected_error": "Expected error",
+}
 _EXTRAS = {"arrows": "Field arrows", "walks": "Survey walks", "outline": "Floor outline"}
 
 
@@ -40,7 +46,8 @@ def panel_html(
 <button type="button" id="isodyn-collapse" aria-expanded="true" aria-controls="isodyn-body">Hide panel</button></header>
 <div id="isodyn-legends" aria-live="polite">{legends}</div>
 <div id="isodyn-body">
-<p id="isodyn-note" role="status" hidden></p>
+<p id="isodyn-note" role="status" hidden>Layers cannot be switched here: they are in the scene tree, which the button at
+the top right of the picture opens.</p>
 <fieldset id="isodyn-controls" disabled><legend class="isodyn-unseen">What is shown</legend>
 {_height_select(heights_m, height_index)}
 <fieldset class="isodyn-layers"><legend>Layer</legend>{_radios(list(layers))}</fieldset>
@@ -51,8 +58,8 @@ def panel_html(
 </fieldset>
 <dl>{told}</dl>
 <details><summary>Layers as numbers</summary>{table(layers, scales, heights_m, height_index)}</details>
-<p class="isodyn-help">Drag to turn, drag with the right button or two fingers to move, wheel or pinch to zoom. Arrow keys
-turn and W, A, S, D, Q, E move. Point at the map, or tap it, to read the field.</p>
+<p class="isodyn-help">Drag to turn, drag with the right button or two fingers to move, wheel or pinch to zoom.
+Arrow keys turn and W, A, S, D, Q, E move. Point at the map, or tap it, to read the field.</p>
 </div></aside>
 <div id="isodyn-readout" hidden></div>"""
 
@@ -60,7 +67,7 @@ turn and W, A, S, D, Q, E move. Point at the map, or tap it, to read the field.<
 def radio_label(layer: str) -> str:
     """A layer's name without what its legend explains in brackets."""
     about = LAYERS[layer]
-    return about.short or about.title.split(" (")[0]
+    return _SHORT.get(layer) or about.short or about.title.split(" (")[0]
 
 
 def _radios(layers: Sequence[str]) -> str:
@@ -77,8 +84,8 @@ def _radios(layers: Sequence[str]) -> str:
 def _radio(layer: str) -> str:
     checked = " checked" if layer == "norm" else ""
     return (
-        f'<label title="{escape(LAYERS[layer].title)}"><input type="radio" name="isodyn-layer" value="{layer}"{checked} />'
-        f"{escape(radio_label(layer))}</label>"
+        f'<label title="{escape(LAYERS[layer].title)}">'
+        f'<input type="radio" name="isodyn-layer" value="{layer}"{checked} />{escape(radio_label(layer))}</label>'
     )
 
 
@@ -134,11 +141,11 @@ def _ticks(layer: str, scale: ColourScale) -> list[tuple[float, str]]:
 
     if layer == "measured":
         return [(0.25, "not measured"), (0.75, "measured")]
-    locator = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10], integer=layer == "coverage")
+    locator = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10], integer=layer == "coverage")
     values = [v for v in locator.tick_values(scale.low, scale.high) if scale.low - 1e-9 <= v <= scale.high + 1e-9]
     step = float(values[1] - values[0]) if len(values) > 1 else 1.0
     decimals = next((d for d in range(6) if abs(round(step, d) - step) < 1e-9 * step), 6)
-    return [((float(v) - scale.low) / (scale.high - scale.low), f"{v:.{decimals}f}") for v in values]
+    return [((float(v) - scale.low) / (scale.high - scale.low), _number(v, decimals)) for v in values]
 
 
 def table(
@@ -153,9 +160,13 @@ def table(
     return f"<table><thead><tr>{head}</tr></thead>{bodies}</table>"
 
 
+def _number(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
 def _row(layer: str, values: Array, scale: ColourScale) -> str:
     known = values[np.isfinite(values)]
     decimals = int(np.clip(2 - np.floor(np.log10(scale.high - scale.low)), 0, 3))
-    numbers = [f"{q:.{decimals}f}" for q in np.percentile(known, [50, 5, 95])] if len(known) else ["–"] * 3
+    numbers = [_number(q, decimals) for q in np.percentile(known, [50, 5, 95])] if len(known) else ["–"] * 3
     cells = "".join(f"<td>{number}</td>" for number in numbers)
     return f'<tr><th scope="row">{escape(radio_label(layer))}</th>{cells}<td>{escape(LAYERS[layer].unit)}</td></tr>'

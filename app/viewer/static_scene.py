@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-
 from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.viewer.floor_scene import OUTLINE_RGB
@@ -130,5 +129,3 @@ def _draw_lines(
 def _node_name(what: str, grid: FieldGrid, k: int) -> str:
     height = f", {grid.heights_m[k]:.2f} m" if len(grid.heights_m) > 1 else ""
     return f"/{what.replace('/', ' per ')}{height}"
-
-

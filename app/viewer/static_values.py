@@ -53,7 +53,7 @@ def thinned_grid(grid: FieldGrid, max_cells: int = MAX_CELLS) -> tuple[FieldGrid
 
 def packed_values(grid: FieldGrid, layers: dict[str, LayerPictures]) -> list[dict[str, object]]:
     """Per height: `mean` and `sd` (uT) of every component, and those layers that cannot be reckoned from them."""
-    told = []
+    told: list[dict[str, object]] = []
     for k, measured in enumerate(grid.measured):
         mean, sd = (
             [pack(np.where(measured, values[k, ..., c], np.nan), _FIELD_STEP_UT) for c in range(values.shape[-1])]

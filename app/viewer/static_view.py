@@ -1,7 +1,7 @@
 """A map as one self-contained HTML file: no server, no network. viser draws the scene, a panel of ours steers it.
 
-The panel's scripts and style are in `static/`. They reach the scene through what viser 1.1 leaves on `window` for its own
-tests (`static/viser.js`); where that is missing, |B| is shown and the layers are in viser's scene tree.
+The panel's scripts and style are in `static/`. They reach the scene through what viser 1.1 leaves on `window` for its
+own tests (`static/viser.js`); where that is missing, |B| is shown and the layers are in viser's scene tree.
 """
 
 import json
@@ -64,7 +64,7 @@ def static_view_html(
         [float(z) for z in grid.heights_m],
         list(scene.extras),
         scene.shown,
-        _facts(grid, len(walks), every, height_index),
+        _facts(grid, len(walks), every),
         height_index,
     )
     data = _data(grid, shown_grid, layers, scene, rings_m, slab_m, height_index)
@@ -84,10 +84,9 @@ def _layers(
     return layers, scales
 
 
-def _facts(grid: FieldGrid, walks: int, every: int, height_index: int) -> dict[str, str]:
-    measured_m2 = float(np.count_nonzero(grid.measured[height_index])) * grid.resolution_m**2
+def _facts(grid: FieldGrid, walks: int, every: int) -> dict[str, str]:
     facts = {
-        "Measured": f"{measured_m2:,.0f} m² at {grid.heights_m[height_index]:.2f} m height",
+        "Measured": _measured(grid),
         "Survey walks": str(walks),
         "Cells": f"{grid.resolution_m:g} m",
         "Ground squares": f"{ground_cell_m([grid]):g} m",
@@ -95,6 +94,13 @@ def _facts(grid: FieldGrid, walks: int, every: int, height_index: int) -> dict[s
     if every > 1:
         facts["Shown"] = f"one cell in {every} along each side, to keep this file small"
     return facts
+
+
+def _measured(grid: FieldGrid) -> str:
+    areas_m2 = np.count_nonzero(grid.measured, axis=(1, 2)) * grid.resolution_m**2
+    if len(areas_m2) > 1 and np.ptp(areas_m2) < 0.5:
+        return f"{areas_m2[0]:,.0f} m² at each of {len(areas_m2)} heights"
+    return ", ".join(f"{area:,.0f} m² at {z:.2f} m height" for area, z in zip(areas_m2, grid.heights_m, strict=True))
 
 
 def _data(
@@ -142,8 +148,8 @@ def _assemble(page: str, title: str, panel: str, data: dict[str, object]) -> str
         f"<style>{style}</style><title>{escape(title)} · Isodyn</title>"
     )
     told = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    tail = f'<script type="application/json" id="isodyn-data">{told}</script><script>"use strict";\n'
-    tail += "\n".join(scripts) + "</script>"
+    program = "\n".join(('(() => {\n"use strict";', *scripts, "})();"))
+    tail = f'<script type="application/json" id="isodyn-data">{told}</script><script>{program}</script>'
     assert "<title>Viser</title>" in page, "viser's page has changed its head"
     assert '<div id="root"></div>' in page, "viser's page has changed its body"
     page = page.replace("<title>Viser</title>", "", 1).replace("<head>", f"<head>{head}", 1)

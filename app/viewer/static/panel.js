@@ -17,6 +17,9 @@
       nodes.forEach((node, k) => Scene.setVisible([node], switched(name) && (nodes.length === 1 || k === chosen.height)));
     for (const legend of all(".isodyn-legend")) legend.hidden = legend.dataset.layer !== chosen.layer;
     for (const body of all("#isodyn-panel tbody")) body.hidden = Number(body.dataset.height) !== chosen.height;
+    const name = data.layers[chosen.layer].label, height_m = data.heights_m[chosen.height].toFixed(2);
+    Scene.canvas().setAttribute("role", "img");
+    Scene.canvas().setAttribute("aria-label", `${name} at ${height_m} m, seen in space; its values are in the panel's table`);
     tellTyped();
   }
 
@@ -86,7 +89,7 @@
     for (const button of all("[data-view]"))
       button.addEventListener("click", () => {
         Object.assign(chosen, { view: button.dataset.view, touched: false });
-        Views.show(chosen.view, data.box_m, true);
+        Views.show(chosen.view, data.box_m, !matchMedia("(prefers-reduced-motion: reduce)").matches);
       });
   }
 
@@ -101,12 +104,9 @@
 
   async function start() {
     listenToCollapse();
-    if (!(await Scene.ready())) {
-      const note = find("#isodyn-note");
-      note.textContent = "Layers cannot be switched from here: they are in the scene tree, the button at the top right.";
-      note.hidden = false;
-      return;
-    }
+    const note = find("#isodyn-note");
+    await Scene.ready(() => { note.hidden = false; });
+    note.hidden = true;
     document.documentElement.classList.add("isodyn-steered");
     find("#isodyn-controls").disabled = false;
     listenToControls();

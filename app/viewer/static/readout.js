@@ -1,4 +1,6 @@
 // The field at a point, from the numbers in the page: bilinear between cell centres, as the server answers.
+const minus = (number) => number.replace("-", "−");
+
 class Readout {
   constructor(data) {
     this.data = data;
@@ -58,7 +60,7 @@ class Readout {
     const place = `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m`, found = this.at(values, x_m, y_m, layer);
     if (found === null) return [place, "not measured"];
     const names = { bx: "Bx", by: "By", bz: "Bz", horizontal: "Horizontal", vertical: "Vertical" };
-    const told = (name, mean, sd) => `${name} ${mean.toFixed(1)} ± ${sd.toFixed(1)} µT`;
+    const told = (name, mean, sd) => `${name} ${minus(mean.toFixed(1))} ± ${sd.toFixed(1)} µT`;
     const lines = [place, told("|B|", found.norm, found.norm_sd)];
     this.data.components.forEach((c, i) => names[c] && lines.push(told(names[c], found.mean[i], found.sd[i])));
     if (found.layer !== undefined) lines.push(this.layerWords(layer, found.layer));
@@ -68,6 +70,6 @@ class Readout {
   layerWords(layer, value) {
     const { label, unit } = this.data.layers[layer];
     if (Number.isNaN(value)) return `${label}: too little measured to tell`;
-    return `${label} ${Number(value.toPrecision(3))}${unit && " " + unit}`;
+    return `${label} ${minus(String(Number(value.toPrecision(3))))}${unit && " " + unit}`;
   }
 }

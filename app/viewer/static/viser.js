@@ -3,7 +3,7 @@
 // tests/viewer/test_static_browser.py fails when that changes.
 const Scene = (() => {
   const NODE_BEFORE_ANY = "/Ground"; // drawn last: once it is there, all the others are
-  const PATIENCE_MS = 30000;
+  const PATIENCE_MS = 15000;
   const state = () => window.__viserMutable;
 
   function isReady() {
@@ -12,17 +12,13 @@ const Scene = (() => {
     return Boolean(viser.nodeRefFromName[""] && viser.canvas && tree.getState()[NODE_BEFORE_ANY]);
   }
 
-  // Resolves to whether the scene can be steered.
-  function ready() {
-    const started = performance.now();
+  // Resolves once the scene can be steered; calls `late` when that takes suspiciously long.
+  function ready(late) {
+    const warning = setTimeout(late, PATIENCE_MS);
     return new Promise((tell) => {
-      const look = () => {
-        if (isReady()) tell(true);
-        else if (performance.now() - started > PATIENCE_MS) tell(false);
-        else setTimeout(look, 50);
-      };
+      const look = () => (isReady() ? tell() : setTimeout(look, 50));
       look();
-    });
+    }).then(() => clearTimeout(warning));
   }
 
   function setVisible(names, visible) {
@@ -64,7 +60,7 @@ const Scene = (() => {
 
 // Where to stand so that a box fills the view: the direction stays, distance and target follow from the box.
 const Views = (() => {
-  const DIRECTIONS = { oblique: [-0.12, -0.8, 0.8], above: [0, -1e-3, 1] };
+  const DIRECTIONS = { oblique: [-0.1, -0.75, 1], above: [0, -1e-3, 1] };
   const FILLED = 0.92; // of the view
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
   const plus = (a, s, b) => a.map((v, i) => v + s * b[i]);
