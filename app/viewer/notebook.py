@@ -17,7 +17,7 @@ class MapInNotebook:
     """A map that a notebook knows how to show: as a page in a frame, or as a picture of `layer` where pages are not."""
 
     grid: FieldGrid
-    stored: StoredLayers = field(default=NONE_STORED, repr=False)
+    stored: StoredLayers = field(default_factory=lambda: NONE_STORED)
     title: str = "Magnetic map"
     layer: str = "norm"
     height_index: int = 0

@@ -169,6 +169,10 @@ def test_the_static_view_is_one_self_contained_page(service: Any, active_map: st
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/html")
     assert b"<html" in answer.content[:2000].lower()
+    for layer in (b"norm", b"bx", b"sd", b"coverage", b"conflict", b"expected_error"):
+        assert b'name="isodyn-layer" value="' + layer in answer.content
+    again = service.http.get(f"/v1/maps/{active_map}/view.html", headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304
 
 
 def test_quality_lists_every_survey(service: Any, active_map: str) -> None:

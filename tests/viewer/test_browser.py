@@ -9,7 +9,6 @@ import pytest
 from matplotlib.image import imread
 from playwright.sync_api import Browser, sync_playwright
 
-
 CHROMIUM = Path("/usr/bin/chromium")
 pytestmark = [
     pytest.mark.browser,
