@@ -166,7 +166,7 @@ def _number(value: float, decimals: int) -> str:
 
 def _row(layer: str, values: Array, scale: ColourScale) -> str:
     known = values[np.isfinite(values)]
-    decimals = int(np.clip(2 - np.floor(np.log10(scale.high - scale.low)), 0, 3))
+    decimals = 0 if layer == "coverage" else int(np.clip(2 - np.floor(np.log10(scale.high - scale.low)), 0, 3))
     numbers = [_number(q, decimals) for q in np.percentile(known, [50, 5, 95])] if len(known) else ["–"] * 3
     cells = "".join(f"<td>{number}</td>" for number in numbers)
     return f'<tr><th scope="row">{escape(radio_label(layer))}</th>{cells}<td>{escape(LAYERS[layer].unit)}</td></tr>'

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.viewer.floor_scene import OUTLINE_RGB
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 __all__ = ["DrawnScene", "draw_static_scene"]
+
+_FIELD_OF_VIEW_RAD = float(np.deg2rad(38.0))  # vertical
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,12 +71,20 @@ def draw_static_scene(
         extras = _draw_arrows(server, grid, scales["norm"], origin, height_index)
         extras |= _draw_lines(server, grid, walks, rings_m, elevation_m, origin)
         draw_ground(server.scene, "/Ground", [grid], origin, elevation_m - 0.02)
-        server.initial_camera.position, server.initial_camera.look_at = camera_pose([grid], origin)
+        _place_camera(server, grid, origin)
         page = str(server.scene.as_html(dark_mode=True))
     finally:
         stop_viser(server)
     hidden = {"walks"} if walks_hide_the_field(walks, [grid]) else set()
     return DrawnScene(page, origin, pictures, extras, frozenset(extras) - hidden)
+
+
+def _place_camera(server: ViserServer, grid: FieldGrid, origin_m: Array) -> None:
+    """A longer lens than viser's, from farther away: arrows at the rim of a view from above lean less."""
+    position, look_at = camera_pose([grid], origin_m)
+    farther = np.tan(server.initial_camera.fov / 2) / np.tan(_FIELD_OF_VIEW_RAD / 2)
+    server.initial_camera.fov = _FIELD_OF_VIEW_RAD
+    server.initial_camera.position, server.initial_camera.look_at = look_at + farther * (position - look_at), look_at
 
 
 def _draw_pictures(
