@@ -303,6 +303,20 @@ def test_map_and_panel_share_every_screen(page, width, height):
     page.set_viewport_size({"width": 900, "height": 700})
 
 
+def test_a_tap_reads_a_point_on_a_tablet(browser, file, grid):
+    context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
+    page = context.new_page()
+    page.goto(file.as_uri())
+    page.wait_for_selector(SCENE_READY, timeout=60_000)
+    page.wait_for_timeout(1000)
+    box = page.locator("#root canvas").first.bounding_box()
+    page.touchscreen.tap(box["x"] + 0.25 * box["width"], box["y"] + 0.55 * box["height"])
+    page.locator("#isodyn-readout").wait_for()
+    x_m, y_m = (float(page.locator(name).input_value()) for name in ("#isodyn-x", "#isodyn-y"))
+    assert_told(page.locator("#isodyn-readout").inner_text(), grid, x_m, y_m, 1.2, place_error_m=0.01)
+    context.close()
+
+
 def test_a_scene_that_cannot_be_steered_still_shows_the_field_and_says_where_the_layers_are(browser, file):
     page = open_page(browser)
     page.add_init_script(

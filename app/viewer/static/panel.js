@@ -76,7 +76,8 @@
       pressed = null;
     }, true);
     stage.addEventListener("wheel", () => { chosen.touched = true; forget(); }, { capture: true, passive: true });
-    stage.addEventListener("pointerleave", forget);
+    // A finger leaves with every tap; what it asked for stays until the next.
+    stage.addEventListener("pointerleave", (event) => event.pointerType === "touch" || forget());
   }
 
   function listenToControls() {
