@@ -373,11 +373,12 @@ def get_heatmap(
     responses={200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
 )
 def get_view(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
+    """Every layer at every height, the walks and the outline: needs no server and no network once it is saved."""
     from app.viewer.database_source import rings_of_polygon
     from app.viewer.source import Walk
     from app.viewer.static_view import static_view_html  # viser is loaded only when somebody looks
 
-    grid, sha256 = _ready_grid(context, identity, map_id)
+    ready = ready_map(context, identity, map_id)
     with context.transaction() as session:
         row = _find_map(session, identity, map_id)
         floor = session.get_one(Floor, row.floor_id)
@@ -387,11 +388,12 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
         samples = [samples_from_bytes(context.blobs.get(survey.samples_sha256)) for survey in surveys]
         walks = [Walk(s.id, s.name, w) for s, w in zip(surveys, samples, strict=True)]
         rings, title = rings_of_polygon(floor.outline), f"{floor.name}: magnetic map"
-        return static_view_html(grid, walks, title, rings, floor.elevation_m).encode()
+        stored = ready.stored_layers(context)
+        return static_view_html(ready.grid, walks, title, rings, floor.elevation_m, stored=stored).encode()
 
-    drawn = [sha256, *(survey.id for survey in surveys), floor.name, floor.elevation_m, floor.outline]
+    drawn = [[survey.id for survey in surveys], floor.name, floor.elevation_m, floor.outline]
     shown = sha256_of(json.dumps(drawn).encode()).hexdigest()
-    return immutable(request, shown, page, "text/html")
+    return immutable(request, ready.tag("view", shown[:16]), page, "text/html")
 
 
 class ReadyMap(NamedTuple):

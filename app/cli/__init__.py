@@ -2,7 +2,7 @@
 
 import typer
 
-from app.cli import client, demo, doctor, evaluate, keys, serve
+from app.cli import client, demo, doctor, evaluate, keys, serve, view
 
 __all__ = ["main"]
 
@@ -19,6 +19,7 @@ main.command()(demo.demo)
 main.command()(client.ingest)
 main.command()(client.locate)
 main.command()(client.export)
+main.command()(view.view)
 main.command()(evaluate.evaluate)
 main.add_typer(keys.commands, name="keys")
 main.command()(doctor.doctor)

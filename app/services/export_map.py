@@ -38,6 +38,7 @@ EXTENSIONS: dict[ExportFormat, str] = {
 
 _CHUNK_CELLS = 512  # a side: a megabyte of single precision
 _DECIMALS = 4
+_NUMBERS = ("ambient_ut", "prior_sd_ut", "noise_sd_ut", "error_correlation_m")  # of the whole map, in an NPZ
 _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the oldest time a zip knows
 
 
@@ -61,6 +62,7 @@ def export_map(
 def _npz(dataset: MapDataset) -> bytes:
     arrays = {f"{axis}_m": dataset.variables[axis].values for axis in AXES}
     arrays["measured"] = dataset.variables["measured"].values.astype(bool)
+    arrays |= {name: np.asarray(dataset.attributes[name], np.float64) for name in _NUMBERS}
     out = io.BytesIO()
     np.savez_compressed(out, allow_pickle=False, **arrays, **{name: v.values for name, v in dataset.data.items()})
     return out.getvalue()

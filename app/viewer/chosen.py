@@ -42,7 +42,15 @@ class Chosen:
     def stage(self) -> tuple[object, ...]:
         """What the scene is built around: when it changes, all of it is drawn anew."""
         return tuple(
-            (f.floor.id, f.floor.name, f.floor.elevation_m, len(f.floor.rings_m), f.map_id, f.grid is None)
+            (
+                f.floor.id,
+                f.floor.name,
+                f.floor.elevation_m,
+                f.floor.plan,
+                f.map_id,
+                f.grid is None,
+                *(ring.tobytes() for ring in f.floor.rings_m),
+            )
             for f in self.floors
         )
 

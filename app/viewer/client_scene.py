@@ -136,6 +136,9 @@ class ClientScene:
         slab_m = min((f.floor.elevation_m for f in chosen.floors), default=0.0)
         draw.draw_ground(scene, "/ground", grids, self._origin_m, slab_m - 0.02)
         self._floors = [DrawnFloor(scene, f"/floor {k}", f, self._origin_m) for k, f in enumerate(chosen.floors)]
+        for drawn in self._floors:
+            if drawn.shown.floor.plan is not None:
+                drawn.draw_plan(self._content.plan(drawn.shown.floor))
         self._arrows_drawn = None
         self._suggested_separation_m = draw.suggested_separation_m(grids)
 

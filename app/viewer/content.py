@@ -6,9 +6,13 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from app.geometry import Array
 from app.viewer.layers import difference_uT, layer_values
-from app.viewer.source import ViewedBuilding, ViewedMap, ViewerSource, Walk
+from app.viewer.scene import plan_picture
+from app.viewer.source import ViewedBuilding, ViewedFloor, ViewedMap, ViewerSource, Walk
 
 __all__ = ["OrganisationContent", "RecentlyUsed"]
 
@@ -80,6 +84,15 @@ class _Layer:
         return self.values.nbytes
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Picture:
+    pixels: NDArray[np.uint8]
+
+    @property
+    def nbytes(self) -> int:
+        return self.pixels.nbytes
+
+
 class OrganisationContent:
     """What one organisation's viewer can reach: there is no way to name another's object here."""
 
@@ -120,6 +133,11 @@ class OrganisationContent:
         self._recent.put(key, _Walks({walk.survey_id: walk for walk in walks}))
         return walks
 
-    def plan_image(self, floor_id: str) -> bytes:
-        """Raises NotFound."""
-        return self._source.plan_image(self._organisation_id, floor_id)
+    def plan(self, floor: ViewedFloor) -> NDArray[np.uint8]:
+        """The picture of a floor's plan (rows, columns, 3), as large as it is drawn. Raises NotFound."""
+        key = (self._organisation_id, "plan", floor.id, floor.plan.sha256 if floor.plan else None)
+
+        def make() -> _Picture:
+            return _Picture(plan_picture(self._source.plan_image(self._organisation_id, floor.id)))
+
+        return self._recent.get(key, _Picture, make).pixels

@@ -103,6 +103,13 @@ class DrawnFloor:
         label = shown.floor.name if shown.grid is not None else f"{shown.floor.name}: no map yet"
         scene.add_label(f"{name}/label", label, position=_label_position(shown, origin_m), anchor="bottom-right")
 
+    def draw_plan(self, picture: NDArray[np.uint8]) -> None:
+        """The floor's plan on its slab."""
+        floor = self.shown.floor
+        assert floor.plan is not None
+        name = f"{self.name}/plan"
+        self.nodes["plan"] = draw.draw_plan(self._scene, name, picture, floor.plan, floor.elevation_m, self.origin_m)
+
     def draw_layer(self, shown: ShownFloor, scale: ColourScale, marks: Marks) -> None:
         """The chosen layer as a picture in its plane; dimmed under marks, and a likelihood over it."""
         likelihood = marks.likelihood if marks.likelihood and marks.likelihood.floor_id == shown.floor.id else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,7 @@ __all__ = ["heatmap_png"]
 
 _DPI = 110
 _LONG_SIDE_INCHES = 8.0
+_NARROW = 0.4  # width over height: a bar that is a share of the map's own width would be a hair
 _UNKNOWN_GREY = "#d0d0d0"
 
 
@@ -60,9 +61,10 @@ def heatmap_png(
     axes = figure.add_subplot()
     scale = colour_scale(layer, [values])
     image = _draw_cells(axes, grid, values, scale, height_index)
-    _draw_colour_bar(figure, axes, image, layer, about, values, scale)
+    name = about.unit if title is None else _named(about)  # the picture's own title names the layer already
+    _draw_colour_bar(figure, axes, image, layer, name, values, scale)
     _draw_scale_bar(figure, axes)
-    text = title or f"{about.title}, z = {grid.heights_m[height_index]:.2f} m"
+    text = title or f"{about.title}, z\u00a0=\u00a0{grid.heights_m[height_index]:.2f}\u00a0m"
     unknown = bool(np.any(grid.measured[height_index] & np.isnan(values)))
     axes.set_title(text + ("\n(grey: measured, but too little to tell)" if unknown else ""), fontsize=11, wrap=True)
     buffer = io.BytesIO()
@@ -72,6 +74,7 @@ def heatmap_png(
 
 def _draw_cells(axes: Axes, grid: FieldGrid, values: Array, scale: ColourScale, height_index: int) -> AxesImage:
     from matplotlib.colors import ListedColormap
+    from matplotlib.ticker import MaxNLocator
 
     x0, y0, _, x1, y1, _ = grid.bounds_m
     half = grid.resolution_m / 2
@@ -90,6 +93,8 @@ def _draw_cells(axes: Axes, grid: FieldGrid, values: Array, scale: ColourScale, 
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.set_facecolor("white")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
     for axis, first_m, last_m in ((axes.xaxis, x0, x1), (axes.yaxis, y0, y1)):
         if last_m - first_m < 0.15 * max(x1 - x0, y1 - y0):  # no room for two numbers
             axis.set_ticks([round((first_m + last_m) / 2)])
@@ -97,20 +102,30 @@ def _draw_cells(axes: Axes, grid: FieldGrid, values: Array, scale: ColourScale, 
 
 
 def _draw_colour_bar(
-    figure: Figure, axes: Axes, image: AxesImage, layer: str, about: Layer, values: Array, scale: ColourScale
+    figure: Figure, axes: Axes, image: AxesImage, layer: str, label: str, values: Array, scale: ColourScale
 ) -> None:
+    """A bar as tall as the map beside it, in steps where the layer has only whole values."""
     from matplotlib.ticker import MaxNLocator
 
+    shape = float(np.ptp(axes.get_xlim()) / np.ptp(axes.get_ylim()))
+    beside = axes.inset_axes((1.03, 0.0, 0.035, 1.0)) if shape >= _NARROW else None
+    place: dict[str, Any] = {"ax": axes, "shrink": 0.85} if beside is None else {"cax": beside}
     if layer == "measured":
-        bar = figure.colorbar(image, ax=axes, shrink=0.85, boundaries=[-0.5, 0.5, 1.5])
-        bar.set_ticks([0.0, 1.0], labels=["not measured", "measured"])
+        bar = figure.colorbar(image, boundaries=[-0.5, 0.5, 1.5], **place)
+        bar.set_ticks([0.0, 1.0], labels=["not\nmeasured", "measured"])
         return
-    bar = figure.colorbar(image, ax=axes, shrink=0.85, extend=_beyond(values, scale))
-    name = about.short or about.title
-    bar.set_label(f"{name} ({about.unit})" if about.unit else name)
-    if layer == "coverage":
-        bar.locator = MaxNLocator(integer=True)
+    counted = np.arange(np.floor(scale.low), np.ceil(scale.high) + 1.0)
+    steps: dict[str, Any] = {"boundaries": np.append(counted - 0.5, counted[-1] + 0.5)} if layer == "coverage" else {}
+    bar = figure.colorbar(image, extend="neither" if steps else _beyond(values, scale), **steps, **place)
+    bar.set_label(label)
+    if steps:
+        bar.locator = MaxNLocator(8, integer=True)
         bar.update_ticks()
+
+
+def _named(about: Layer) -> str:
+    name = about.short or about.title
+    return f"{name} ({about.unit})" if about.unit else name
 
 
 def _draw_scale_bar(figure: Figure, axes: Axes) -> None:
@@ -148,5 +163,5 @@ def _size_inches(shape: tuple[int, ...]) -> tuple[float, float]:
     ny, nx = shape
     aspect = float(np.clip(ny / nx, 0.25, 2.0))
     if aspect <= 1.0:
-        return _LONG_SIDE_INCHES, _LONG_SIDE_INCHES * aspect * 0.85 + 1.2
+        return _LONG_SIDE_INCHES, max(_LONG_SIDE_INCHES * aspect * 0.81 + 1.1, 2.8)
     return _LONG_SIDE_INCHES / aspect + 1.6, _LONG_SIDE_INCHES + 0.3

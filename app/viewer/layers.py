@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from html import escape
 from types import MappingProxyType
 
 import numpy as np
@@ -27,7 +26,6 @@ __all__ = [
     "difference_uT",
     "layer_names",
     "layer_values",
-    "legend_html",
     "nearest_height",
 ]
 
@@ -243,20 +241,3 @@ def colour_scale(layer: str, values: Iterable[Array]) -> ColourScale:
     if high - low < 1e-6 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
     return ColourScale(low, high, LAYERS[layer].colour_map)
-
-
-def legend_html(layer: str, scale: ColourScale) -> str:
-    """A legend as self-contained HTML: title, colour bar, five values and the unit, readable without seeing colours."""
-    stops = scale.rgb(np.linspace(scale.low, scale.high, 12))
-    gradient = ", ".join(f"rgb({r},{g},{b})" for r, g, b in stops)
-    decimals = int(np.clip(2 - np.floor(np.log10(scale.high - scale.low)), 0, 3))
-    ticks = "".join(f"<span>{value:.{decimals}f}</span>" for value in np.linspace(scale.low, scale.high, 5))
-    about = LAYERS[layer]
-    label = f"{about.title}, {about.unit}" if about.unit else about.title
-    return (
-        f'<div role="img" aria-label="{escape(label)}: from {scale.low:.{decimals}f} to {scale.high:.{decimals}f}">'
-        f'<div style="font-size:0.85em;margin-bottom:0.3em">{escape(label)}</div>'
-        f'<div style="height:0.9em;border-radius:0.2em;background:linear-gradient(to right, {gradient})"></div>'
-        f'<div style="display:flex;justify-content:space-between;font-size:0.75em;margin-top:0.2em;'
-        f'font-variant-numeric:tabular-nums">{ticks}</div></div>'
-    )

@@ -1,7 +1,7 @@
 """The page `/view/`: sign in with an API key, then look at your organisation's floors, and work on them.
 
 `ViewerApp` is an ASGI application to be mounted at `/view` in the API's own, so that the page shares its port and
-origin. The page itself is plain HTML and JavaScript (`assets/`); in it is a frame with viser's canvas. It asks
+origin. The page itself is plain HTML and JavaScript (`assets/live/`); in it is a frame with viser's canvas. It asks
 `/view/scene/...` for what the canvas shows, and `/view/v1/...`, the API behind the session's key, for all else.
 """
 
@@ -172,7 +172,7 @@ class ViewerApp:
 def _read_assets() -> dict[str, tuple[bytes, str, str]]:
     """The page's files with their media types and tags, by name."""
     read = {}
-    for file in files("app.viewer").joinpath("assets").iterdir():
+    for file in files("app.viewer").joinpath("assets/live").iterdir():
         suffix = file.name[file.name.rfind(".") :]
         if suffix in _TYPES:
             data = file.read_bytes()

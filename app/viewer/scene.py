@@ -7,6 +7,7 @@ meshes are not), its unmeasured cells are transparent, and a floor costs kilobyt
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from app.field.grid import FieldGrid
-from app.geometry import Array
+from app.geometry import Array, yaw_matrix
 from app.viewer.layers import ColourScale
-from app.viewer.source import Walk
+from app.viewer.source import PlacedPlan, Walk
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,10 +37,12 @@ __all__ = [
     "draw_arrows",
     "draw_ground",
     "draw_lines",
+    "draw_plan",
     "draw_surface",
     "field_arrows",
     "ground_cell_m",
     "local_origin_m",
+    "plan_picture",
     "ring_segments",
     "suggested_arrow_spacing_m",
     "suggested_separation_m",
@@ -51,6 +54,7 @@ __all__ = [
 MAX_POINTS = 300_000
 MAX_ARROWS = 20_000
 _MAX_WALK_SEGMENTS = 60_000
+_PLAN_PX = 2048
 _USUAL_ARROWS = 320
 _CLEARANCE_M = 0.04  # lifts lines and arrows off the plane they would otherwise flicker against
 
@@ -243,6 +247,35 @@ def ring_segments(rings_m: Sequence[Array], elevation_m: float, origin_m: Array)
         p = np.column_stack([ring[:, :2], np.full(len(ring), elevation_m)]) - origin_m
         segments.append(np.stack([p, np.roll(p, -1, axis=0)], axis=1))
     return np.concatenate(segments).astype(np.float32)
+
+
+def plan_picture(picture: bytes) -> NDArray[np.uint8]:
+    """A floor plan's picture as (rows, columns, 3), at most _PLAN_PX a side, transparent places white.
+
+    Opaque, because of two transparent planes the renderer shows one or the other.
+    """
+    from PIL import Image
+
+    with Image.open(io.BytesIO(picture)) as image:
+        image.thumbnail((_PLAN_PX, _PLAN_PX))
+        shown = image.convert("RGBA")
+        paper = Image.new("RGBA", shown.size, "white")
+        return np.array(Image.alpha_composite(paper, shown).convert("RGB"))
+
+
+def draw_plan(
+    scene: SceneApi, name: str, picture: NDArray[np.uint8], plan: PlacedPlan, elevation_m: float, origin_m: Array
+) -> ImageHandle:
+    """Lay a floor plan on the slab: its lower left corner where it is placed, turned about that corner."""
+    turn = yaw_matrix(plan.bearing_rad)
+    corner_m = np.array([plan.x_m, plan.y_m, elevation_m])
+    centre_m = corner_m + turn @ np.array([plan.width_m / 2.0, plan.height_m / 2.0, 0.0]) - origin_m
+    half = plan.bearing_rad / 2.0
+    return scene.add_image(
+        name, picture, plan.width_m, plan.height_m, format="jpeg", cast_shadow=False, receive_shadow=False,
+        wxyz=(float(np.cos(half)), 0.0, 0.0, float(np.sin(half))),
+        position=(float(centre_m[0]), float(centre_m[1]), float(centre_m[2])),
+    )  # fmt: skip
 
 
 def draw_surface(scene: SceneApi, name: str, picture: Surface, visible: bool = True) -> ImageHandle:

@@ -118,7 +118,7 @@ def test_a_layer_it_does_not_have_names_the_layers_there_are(service: Any, old_m
     for headers in ({}, {"If-None-Match": "*"}):
         answer = service.http.get(f"/v1/maps/{old_map}/heatmap.png", params={"layer": layer}, headers=headers)
         assert answer.status_code == 422
-        assert "one of norm, bx, by, bz, sd, gradient" in answer.json()["detail"]
+        assert "one of norm, bx, by, bz, inclination, sd, gradient" in answer.json()["detail"]
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +169,10 @@ def test_the_static_view_is_one_self_contained_page(service: Any, active_map: st
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/html")
     assert b"<html" in answer.content[:2000].lower()
+    for layer in (b"norm", b"bx", b"sd", b"coverage", b"conflict", b"expected_error"):
+        assert b'name="isodyn-layer" value="' + layer in answer.content
+    again = service.http.get(f"/v1/maps/{active_map}/view.html", headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304
 
 
 def test_quality_lists_every_survey(service: Any, active_map: str) -> None:

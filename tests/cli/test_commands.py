@@ -33,7 +33,20 @@ def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_every_command_explains_itself() -> None:
-    for command in ("serve", "worker", "demo", "ingest", "locate", "export", "evaluate", "keys", "doctor", "openapi"):
+    commands = (
+        "serve",
+        "worker",
+        "demo",
+        "ingest",
+        "locate",
+        "export",
+        "view",
+        "evaluate",
+        "keys",
+        "doctor",
+        "openapi",
+    )
+    for command in commands:
         result = runner.invoke(main, [command, "--help"])
         assert result.exit_code == 0, result.output
 

@@ -66,7 +66,9 @@ def read(format: ExportFormat, data: bytes, folder: Path) -> xr.Dataset:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = dict(file)
         axes = {axis: arrays.pop(f"{axis}_m") for axis in "zyx"}
-        return xr.Dataset({name: (("z", "y", "x"), values) for name, values in arrays.items()}, axes)
+        return xr.Dataset(
+            {name: (("z", "y", "x"), values) for name, values in arrays.items() if values.ndim == 3}, axes
+        )
     coverage = Coverage.model_validate_json(data)
     ranges = {
         name: (r.axisNames, np.array(r.values, dtype=float).reshape(r.shape)) for name, r in coverage.ranges.items()

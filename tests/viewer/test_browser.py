@@ -1,4 +1,4 @@
-"""The page in a real browser: somebody signs in and sees a field; a static page opens without any network."""
+"""The page in a real browser: somebody signs in and sees a field."""
 
 import io
 import os
@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from playwright.sync_api import Browser, sync_playwright
-
-from app.viewer.static_view import static_view_html
 
 CHROMIUM = Path("/usr/bin/chromium")
 pytestmark = [
@@ -82,18 +80,4 @@ def test_the_client_connects_to_no_other_server(running, browser):
         })"""
     )
     assert refused == "connect-src"
-    page.close()
-
-
-def test_the_static_page_opens_without_any_network(browser, grid_of, walk_of, tmp_path):
-    file = tmp_path / "view.html"
-    file.write_text(static_view_html(grid_of(), [walk_of("a")], "Tower"), encoding="utf-8")
-    page = new_page(browser)
-    asked: list[str] = []
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto(file.as_uri())
-    wait_for_field(page)
-    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
-    assert page.get_by_text("Magnitude |B|, µT").is_visible()
-    assert page.faults == []
     page.close()

@@ -11,7 +11,6 @@ from app.db.tables import Base, Building, Floor, Map, Organisation, Survey
 from app.errors import NotFound
 from app.field.samples import Samples
 from app.services.artefacts import grid_to_bytes, samples_to_bytes
-from app.viewer.content import OrganisationContent, RecentlyUsed
 from app.viewer.database_source import DatabaseViewerSource, rings_of_polygon
 from app.viewer.source import PlacedPlan
 
@@ -118,11 +117,10 @@ def test_a_floor_has_its_plan_and_where_it_lies(storage):
     ground, first = source.buildings("north")[0].floors
     assert ground.plan == PlacedPlan(sha256(b"a picture").hexdigest(), 9.0, 6.0, -1.0, 2.0, 0.5)
     assert first.plan is None
-    content = OrganisationContent("north", source, RecentlyUsed(1))
-    assert content.plan_image(ground.id) == b"a picture"
+    assert source.plan_image("north", ground.id) == b"a picture"
     for floor in (first.id, "f0-south"):
         with pytest.raises(NotFound):
-            content.plan_image(floor)
+            source.plan_image("north", floor)
 
 
 def test_every_ring_of_every_polygon_is_drawn():

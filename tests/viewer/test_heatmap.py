@@ -72,6 +72,23 @@ def test_a_stored_layer_is_drawn_with_grey_where_it_knows_nothing(grid_of):
     assert grey[1] > 0.1
 
 
+def test_the_colour_bar_is_as_tall_as_the_map(grid_of):
+    rgb = imread(io.BytesIO(heatmap_png(grid_of(size_m=(24.0, 14.0)), "norm")))[..., :3]
+    coloured = np.ptp(rgb, axis=-1) > 0.1
+    rows = [np.flatnonzero(part.any(axis=1))[[0, -1]] for part in (coloured[:, :720], coloured[:, 760:])]
+    np.testing.assert_allclose(rows[0], rows[1], atol=4)
+
+
+def test_surveys_are_counted_in_whole_steps(grid_of):
+    """The bar has a colour per number of surveys, and none between."""
+    grid = grid_of()
+    coverage = np.broadcast_to(1.0 + np.arange(grid.measured.shape[2]) % 4, grid.measured.shape)
+    png = heatmap_png(grid, "coverage", stored={"coverage": coverage.astype(np.float32)})
+    bar = np.round(imread(io.BytesIO(png))[:, 760:, :3] * 32).reshape(-1, 3)
+    colours, counts = np.unique(bar, axis=0, return_counts=True)
+    assert (counts[np.ptp(colours, axis=1) > 0] > 1500).sum() == 4
+
+
 def _longest_run(row) -> int:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
     return int((edges[1::2] - edges[::2]).max(initial=0))

@@ -11,11 +11,12 @@ from app.viewer.layers import (
     LAYERS,
     ColourScale,
     colour_scale,
+    difference_uT,
     layer_names,
     layer_values,
-    legend_html,
     nearest_height,
 )
+from app.viewer.legends import legend
 
 
 @pytest.mark.parametrize("components", ["vector", "level", "norm"])
@@ -123,7 +124,33 @@ def test_colours_are_monotone_in_lightness():
 
 
 def test_a_legend_says_name_unit_and_range_in_words():
-    html = legend_html("gradient", ColourScale(0.25, 12.0))
-    assert 'aria-label="Gradient along the floor, µT/m: from 0.2 to 12.0"' in html
-    assert html.count("<span>") == 5
-    assert "linear-gradient" in html
+    told = legend("Gradient along the floor", "µT/m", ColourScale(0.25, 12.0))
+    assert (told.title, told.unit) == ("Gradient along the floor", "µT/m")
+    assert told.ticks == ["0.2", "3.2", "6.1", "9.1", "12.0"]
+    assert told.colours[0] == "rgb(68,1,84)"  # viridis
+    assert told.colours[-1] == "rgb(253,231,36)"
+
+
+def test_the_inclination_is_the_dip_of_the_mean_field(grid_of):
+    grid = grid_of()
+    dip = layer_values(grid, "inclination")
+    j, i = np.argwhere(grid.measured[0])[100]
+    bx, by, bz = grid.mean_uT[0, j, i]
+    assert dip[j, i] == pytest.approx(np.degrees(np.arctan2(-bz, np.hypot(bx, by))))
+    assert dip[j, i] > 0  # in the north the field dips down
+    np.testing.assert_allclose(layer_values(grid_of("level"), "inclination"), dip, atol=1e-4)
+    assert "inclination" not in layer_names("norm")
+
+
+def test_the_difference_of_two_maps_is_that_of_their_fields_where_both_were_measured(grid_of):
+    grid, other = grid_of(), grid_of(seed=4, origin_m=(102.0, 41.0))
+    difference = difference_uT(grid, other)[0]
+    j, i = 20, 30
+    x, y = 100.0 + 0.25 * i, 40.0 + 0.25 * j
+    there = other.at(np.array([[x, y, 1.2]]))
+    assert there.measured[0]
+    assert difference[j, i] == pytest.approx(np.linalg.norm(grid.mean_uT[0, j, i] - there.mean_uT[0]), rel=1e-5)
+    assert np.isnan(difference[0, 0])  # beside the other map
+    assert np.nanmax(difference_uT(grid, grid)) == 0.0
+    norms = difference_uT(grid, grid_of("norm"))
+    assert np.nanmax(norms) < 1e-3
