@@ -1,8 +1,8 @@
-"""Lists by opaque cursor: `{"items": [...], "links": {"next"?: ...}}`, oldest first."""
+"""Lists by opaque cursor: `{"items": [...], "links": {"next"?: ...}}`, oldest first unless asked otherwise."""
 
 from base64 import urlsafe_b64decode, urlsafe_b64encode
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from fastapi import Depends, Query, Request
 from pydantic import BaseModel, Field
@@ -25,15 +25,16 @@ class Page(BaseModel, Generic[Item]):
 
 
 class Paging:
-    """The cursor and limit of a list request."""
+    """The cursor, limit and order of a list request."""
 
     def __init__(
         self,
         request: Request,
         cursor: Annotated[str | None, Query(max_length=200, description="from `links.next`")] = None,
         limit: Annotated[int, Query(ge=1, le=200, description="most items on one page")] = 50,
+        order: Annotated[Literal["oldest", "newest"], Query(description="which comes first")] = "oldest",
     ) -> None:
-        self.url, self.limit = request.url, limit
+        self.url, self.limit, self.newest_first = request.url, limit, order == "newest"
         self.after = None if cursor is None else _decode(cursor)
 
 
@@ -47,10 +48,12 @@ def list_page(
     paging: Paging,
     show: Callable[[Row], Item],
 ) -> Page[Item]:
-    """One page of the statement's rows in order of id, which is the order of creation."""
+    """One page of the statement's rows in order of id, which is the order of creation, or backwards."""
+    backwards = paging.newest_first
     if paging.after is not None:
-        statement = statement.where(id_column > paging.after)
-    rows: Sequence[Any] = session.scalars(statement.order_by(id_column).limit(paging.limit + 1)).all()
+        statement = statement.where(id_column < paging.after if backwards else id_column > paging.after)
+    order = id_column.desc() if backwards else id_column
+    rows: Sequence[Any] = session.scalars(statement.order_by(order).limit(paging.limit + 1)).all()
     links = {}
     if len(rows) > paging.limit:
         last = rows[paging.limit - 1].id

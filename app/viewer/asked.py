@@ -32,6 +32,7 @@ class Shown(_Asked):
     height_m      of the map; None: its lowest
     walks         None: unless they lie so close that they would hide the field
     separation_m  added between floors; None: as much as shows each floor
+    aspect        width of the canvas by its height, which the usual camera takes into account
     """
 
     building_id: Id | None = None
@@ -46,6 +47,7 @@ class Shown(_Asked):
     plan: bool = True
     separation_m: Annotated[float, Field(ge=0, le=100)] | None = None
     camera: Literal["keep", "oblique", "top"] | CameraPose = "keep"
+    aspect: Annotated[float, Field(ge=0.1, le=10)] = 1.3
 
 
 class Target(_Asked):

@@ -9,7 +9,7 @@ import numpy as np
 
 from app.errors import InvalidInput, NotFound
 from app.viewer.asked import Shown
-from app.viewer.floor_scene import ShownFloor, walk_residuals
+from app.viewer.floor_scene import ShownFloor
 from app.viewer.layers import LAYERS
 from app.viewer.picture import OfferedLayer, offered_layers
 from app.viewer.source import ViewedBuilding, ViewedFloor
@@ -89,6 +89,8 @@ def _floors(
     chosen = next((b for b in buildings if b.id == asked.building_id), None)
     if chosen is None and asked.building_id is not None:
         notes.append("The building of this link is not there, or is not your organisation's.")
+    if not buildings:
+        notes.append("There are no buildings yet. Make one with POST /v1/buildings, then survey it.")
     chosen = chosen or next((b for b in buildings if b.floors), buildings[0] if buildings else None)
     return chosen, chosen.floors if chosen else ()
 
@@ -137,4 +139,5 @@ def _shown(
         return ShownFloor(floor.floor, walks)
     k = 0 if height_m is None else int(np.argmin(np.abs(floor.grid.heights_m - height_m)))
     values = content.layer(floor.map_id, layer, k, versus_id)
-    return ShownFloor(floor.floor, walks, floor.map_id, floor.grid, values, k, walk_residuals(floor.grid, walks))
+    residuals_uT = content.residuals_uT(floor.map_id, walks)
+    return ShownFloor(floor.floor, walks, floor.map_id, floor.grid, values, k, residuals_uT)

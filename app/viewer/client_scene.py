@@ -20,7 +20,7 @@ from app.viewer.layers import LAYERS, ColourScale, about_layer
 from app.viewer.legends import legend
 from app.viewer.marks import draw_marks, likelihood_legend
 from app.viewer.picture import Marked, Picked, Picture, SupportView, floors_in_words
-from app.viewer.pointing import camera_ray, plane_hit, supporting_walks
+from app.viewer.pointing import camera_ray, kept_upright, plane_hit, supporting_walks
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
@@ -107,8 +107,8 @@ class ClientScene:
         """Where the camera is now, in building metres (floors as they lie, not as they are pulled apart)."""
         with self._lock:
             camera, origin = self._client.camera, self._origin_m
-            position, target = np.asarray(camera.position) + origin, np.asarray(camera.look_at) + origin
-            return CameraPose(position_m=position.tolist(), look_at_m=target.tolist())
+            position, target = kept_upright(camera.wxyz, np.asarray(camera.position), np.asarray(camera.look_at))
+            return CameraPose(position_m=(position + origin).tolist(), look_at_m=(target + origin).tolist())
 
     def resume(self, before: ClientScene) -> None:
         """Show what another scene of the same view showed, where its camera still is."""
@@ -149,7 +149,8 @@ class ClientScene:
         residuals = residual_scale(chosen.floors)
         for drawn, shown in zip(self._floors, chosen.floors, strict=True):
             self._draw_layer(drawn, shown)
-            drawn.draw_walks(residuals, bool(asked.walks))
+            if asked.walks:
+                drawn.draw_walks(residuals)
         self._draw_marks()
         about = about_layer(chosen.layer)
         grids = [f.grid for f in chosen.floors if f.grid is not None]
@@ -225,18 +226,18 @@ class ClientScene:
         if isinstance(asked.camera, CameraPose):
             position, target = (np.array(p) - self._origin_m for p in (asked.camera.position_m, asked.camera.look_at_m))
         else:
-            position, target = self._usual_pose(top=asked.camera == "top")
+            position, target = self._usual_pose(asked.camera == "top", asked.aspect)
         with self._client.atomic():
             self._client.camera.position = position
             self._client.camera.look_at = target
 
-    def _usual_pose(self, top: bool) -> tuple[Array, Array]:
+    def _usual_pose(self, top: bool, aspect: float) -> tuple[Array, Array]:
         shown = [drawn.shown for drawn in self._floors]
         grids = [s.grid for s in shown if s.grid is not None]
         highest_map_m = max((float(grid.heights_m[-1]) for grid in grids), default=0.0)
         highest_m = max([highest_map_m, *(s.floor.elevation_m for s in shown)])
         spread_m = self._separation_m * max(len(self._floors) - 1, 0) + highest_m - highest_map_m
-        return draw.camera_pose(grids, self._origin_m, top, spread_m, self._client.camera.aspect)
+        return draw.camera_pose(grids, self._origin_m, top, spread_m, aspect)
 
     # -- words ------------------------------------------------------------------------------------------------------
 

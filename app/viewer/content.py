@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.viewer.layers import difference_uT, layer_values
+from app.viewer.pointing import walk_residuals
 from app.viewer.scene import plan_picture
 from app.viewer.source import ViewedBuilding, ViewedFloor, ViewedMap, ViewerSource, Walk
 
@@ -85,6 +86,15 @@ class _Layer:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Residuals:
+    each: tuple[Array, ...]
+
+    @property
+    def nbytes(self) -> int:
+        return sum(residual.nbytes for residual in self.each)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Picture:
     pixels: NDArray[np.uint8]
 
@@ -132,6 +142,11 @@ class OrganisationContent:
         walks = self._source.walks(self._organisation_id, floor_id, known.by_survey if known else {})
         self._recent.put(key, _Walks({walk.survey_id: walk for walk in walks}))
         return walks
+
+    def residuals_uT(self, map_id: str, walks: Sequence[Walk]) -> tuple[Array, ...]:
+        """(n,) of each walk, what it measured less the map (`walk_residuals`). Raises NotFound."""
+        key = (self._organisation_id, "residuals", map_id, *(walk.survey_id for walk in walks))
+        return self._recent.get(key, _Residuals, lambda: _Residuals(walk_residuals(self.map(map_id).grid, walks))).each
 
     def plan(self, floor: ViewedFloor) -> NDArray[np.uint8]:
         """The picture of a floor's plan (rows, columns, 3), as large as it is drawn. Raises NotFound."""

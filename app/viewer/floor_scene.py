@@ -15,18 +15,16 @@ from app.viewer import scene as draw
 from app.viewer.asked import Marks
 from app.viewer.layers import ColourScale, colour_scale, layer_values
 from app.viewer.marks import blend_likelihood
-from app.viewer.pointing import walk_residual_uT
 from app.viewer.source import ViewedFloor, Walk
 
 if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi, SceneNodeHandle
 
-__all__ = ["OUTLINE_RGB", "DrawnFloor", "ShownFloor", "residual_scale", "shared_scales", "walk_residuals"]
+__all__ = ["OUTLINE_RGB", "DrawnFloor", "ShownFloor", "residual_scale", "shared_scales"]
 
 OUTLINE_RGB = (190, 200, 210)
 _UNKNOWN_RGB = (140, 140, 140)
 _RESIDUAL_MAP = "YlOrRd"
-_RESIDUAL_OVER_M = 1.0
 _DIMMED = 0.4
 
 
@@ -53,29 +51,6 @@ class ShownFloor:
         return self.floor.elevation_m if self.grid is None else float(self.grid.heights_m[self.height_index])
 
 
-def walk_residuals(grid: FieldGrid, walks: Sequence[Walk]) -> tuple[Array, ...]:
-    """(n,) of each walk: length of the mean, over a metre walked, of what was measured less the map, uT.
-
-    NaN where that is not known. The mean leaves out the sensor's noise, which says nothing of the map.
-    """
-    return tuple(_residual_uT(grid, walk) for walk in walks)
-
-
-def _residual_uT(grid: FieldGrid, walk: Walk) -> Array:
-    residual_uT = walk_residual_uT(grid, walk)
-    if residual_uT is None:
-        return np.full(len(walk.samples), np.nan)
-    path_m = walk.samples.path_length_m()
-    known = np.isfinite(residual_uT[:, :1])
-    sums = np.cumsum(np.vstack([np.zeros(residual_uT.shape[1] + 1),
-                                np.hstack([np.where(known, residual_uT, 0.0), known])]), axis=0)  # fmt: skip
-    first = np.searchsorted(path_m, path_m - _RESIDUAL_OVER_M / 2.0)
-    last = np.searchsorted(path_m, path_m + _RESIDUAL_OVER_M / 2.0, side="right")
-    near = sums[last] - sums[first]
-    mean_uT = near[:, :-1] / np.maximum(near[:, -1:], 1.0)
-    return np.where(known[:, 0], np.linalg.norm(mean_uT, axis=1), np.nan)
-
-
 def shared_scales(shown: Sequence[ShownFloor], layer: str) -> tuple[ColourScale, ColourScale]:
     """The colour scales of a layer and of |B| over all floors together, so that floors can be compared."""
     norms = [layer_values(s.grid, "norm", s.height_index) for s in shown if s.grid is not None]
@@ -96,7 +71,9 @@ class DrawnFloor:
         self._scene = scene
         self.frame: FrameHandle = scene.add_frame(name, show_axes=False)
         self.nodes: dict[str, SceneNodeHandle] = {}
-        self._layer_drawn: object = None
+        self._values_drawn: Array | None = None
+        self._look_drawn: object = None
+        self._residuals_drawn: tuple[Array, ...] | None = None
         outline = draw.ring_segments(shown.floor.rings_m, shown.floor.elevation_m, origin_m)
         if len(outline):
             self.nodes["outline"] = draw.draw_lines(scene, f"{name}/outline", outline, OUTLINE_RGB, 2.0)
@@ -113,9 +90,10 @@ class DrawnFloor:
     def draw_layer(self, shown: ShownFloor, scale: ColourScale, marks: Marks) -> None:
         """The chosen layer as a picture in its plane; dimmed under marks, and a likelihood over it."""
         likelihood = marks.likelihood if marks.likelihood and marks.likelihood.floor_id == shown.floor.id else None
-        wanted = (shown.map_id, None if shown.values is None else id(shown.values), scale, bool(marks), likelihood)
+        look = (scale, bool(marks), likelihood)
+        same = shown.values is self._values_drawn and look == self._look_drawn
         self.shown = shown
-        if shown.grid is None or shown.values is None or wanted == self._layer_drawn:
+        if shown.grid is None or shown.values is None or same:
             return
         picture = draw.surface(shown.grid, shown.values, scale, self.origin_m, shown.height_index)
         if marks:
@@ -123,15 +101,16 @@ class DrawnFloor:
         if likelihood is not None:
             blend_likelihood(picture, likelihood, self.origin_m)
         draw.draw_surface(self._scene, f"{self.name}/layer", picture)
-        self._layer_drawn = wanted
+        self._values_drawn, self._look_drawn = shown.values, look
 
-    def draw_walks(self, scale: ColourScale | None, visible: bool) -> None:
-        """The walks, in the colours of their residuals."""
-        if not self.shown.walks:
+    def draw_walks(self, scale: ColourScale | None) -> None:
+        """The walks, in the colours of their residuals; nothing when they are drawn already."""
+        if not self.shown.walks or self.shown.residual_uT is self._residuals_drawn:
             return
         colours = None if scale is None else [_residual_rgb(r, scale) for r in self.shown.residual_uT]
         segments, rgb = draw.walk_segments(self.shown.walks, self.origin_m, colours or None)
-        self.nodes["walks"] = draw.draw_lines(self._scene, f"{self.name}/walks", segments, rgb, 3.0, visible)
+        self.nodes["walks"] = draw.draw_lines(self._scene, f"{self.name}/walks", segments, rgb, 3.0)
+        self._residuals_drawn = self.shown.residual_uT
 
     def draw_arrows(self, scale: ColourScale, spacing_m: float, box_m: draw.Box, visible: bool) -> int:
         """Field arrows in a part of the floor; returns how many."""

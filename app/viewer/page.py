@@ -5,6 +5,7 @@ origin. The page itself is plain HTML and JavaScript (`assets/live/`); in it is 
 `/view/scene/...` for what the canvas shows, and `/view/v1/...`, the API behind the session's key, for all else.
 """
 
+import secrets
 import time
 from collections.abc import Callable, Mapping
 from hashlib import sha256
@@ -65,8 +66,8 @@ class ViewerApp:
         self._source = source
         self._session_seconds = session_seconds
         self._assets = _read_assets()
-        scenes = SceneEndpoints(self.signed_in, self.pool, COOKIE)
-        self._router = Router([*self._routes(), *scenes.routes()], redirect_slashes=False)
+        self._scenes = SceneEndpoints(self.signed_in, self.pool, COOKIE)
+        self._router = Router([*self._routes(), *self._scenes.routes()], redirect_slashes=False)
         if api is not None:
             self._router.mount("/v1", ApiDoor(api, self.signed_in, COOKIE))
 
@@ -86,6 +87,7 @@ class ViewerApp:
     async def close(self) -> None:
         """End every session and stop every viser server."""
         self.signed_in.close_all()
+        await self._scenes.close()
         await self.pool.close()
 
     async def _show(self, request: Request) -> Response:
@@ -94,7 +96,8 @@ class ViewerApp:
             return _sign_in_page(request, _link(request.query_params))
         headers = {**SECURITY_HEADERS, "X-Frame-Options": "DENY", "Content-Security-Policy": _SHELL_POLICY,
                    "Cache-Control": "no-store", "Vary": "Cookie"}  # fmt: skip
-        return HTMLResponse(self._assets["page.html"][0], headers=headers)
+        page = self._assets["page.html"][0].replace(b"VIEW", secrets.token_hex(12).encode())
+        return HTMLResponse(page, headers=headers)
 
     async def _sign_in(self, request: Request) -> Response:
         """Take a key, give a cookie."""
@@ -107,6 +110,7 @@ class ViewerApp:
         session = await self.signed_in.open(form.get("key", "").strip())
         if session is None:
             return _sign_in_page(request, _link(form), wrong_key=True)
+        self._scenes.expect(session.organisation_id)
         query = urlencode(_link(form))
         address = f"{_prefix(request)}/" + (f"?{query}" if query else "")
         response = RedirectResponse(address, HTTPStatus.SEE_OTHER, SECURITY_HEADERS)

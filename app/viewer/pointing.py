@@ -10,9 +10,14 @@ from app.field.grid import FieldGrid
 from app.geometry import Array, rotate_by_quaternion
 from app.viewer.source import Walk
 
-__all__ = ["SUPPORT_WITHIN_M", "Support", "camera_ray", "plane_hit", "supporting_walks", "walk_residual_uT"]
+__all__ = [
+    "SUPPORT_WITHIN_M", "Support", "camera_ray", "kept_upright", "plane_hit", "supporting_walks", "walk_residual_uT",
+    "walk_residuals",
+]  # fmt: skip
 
 SUPPORT_WITHIN_M = 1.0
+RESIDUAL_OVER_M = 1.0
+_UPRIGHT = 1e-3  # radians off the vertical
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,20 @@ def camera_ray(q_wxyz: Array, fov_rad: float, aspect: float, u: float, v: float)
     return np.asarray(direction / np.linalg.norm(direction))
 
 
+def kept_upright(q_wxyz: Array, position_m: Array, look_at_m: Array) -> tuple[Array, Array]:
+    """The camera's position and target, such that from these alone the picture has the same side up.
+
+    One that looks straight down is moved back a little: otherwise any side could be up.
+    """
+    away_m = position_m - look_at_m
+    distance_m = float(np.linalg.norm(away_m))
+    if np.hypot(away_m[0], away_m[1]) > _UPRIGHT * distance_m:
+        return position_m, look_at_m
+    up = rotate_by_quaternion(np.asarray(q_wxyz, dtype=np.float64), np.array([0.0, -1.0, 0.0]))[:2]
+    back_m = -_UPRIGHT * distance_m * up / max(float(np.linalg.norm(up)), 1e-12)
+    return look_at_m + np.array([back_m[0], back_m[1], away_m[2]]), look_at_m
+
+
 def plane_hit(position_m: Array, direction: Array, z_m: float) -> tuple[float, Array] | None:
     """Where a ray meets the horizontal plane at z_m: distance and point (3,); None where it never does."""
     if abs(direction[2]) < 1e-9:
@@ -59,6 +78,29 @@ def walk_residual_uT(grid: FieldGrid, walk: Walk) -> Array | None:
         return None
     there = grid.at(walk.p_building_m)
     return np.asarray(np.where(there.measured[:, None], measured_uT - there.mean_uT, np.nan))
+
+
+def walk_residuals(grid: FieldGrid, walks: Sequence[Walk]) -> tuple[Array, ...]:
+    """(n,) of each walk: length of the mean, over a metre walked, of what was measured less the map, uT.
+
+    NaN where that is not known. The mean leaves out the sensor's noise, which says nothing of the map.
+    """
+    return tuple(_mean_over_a_metre_uT(grid, walk) for walk in walks)
+
+
+def _mean_over_a_metre_uT(grid: FieldGrid, walk: Walk) -> Array:
+    residual_uT = walk_residual_uT(grid, walk)
+    if residual_uT is None:
+        return np.full(len(walk.samples), np.nan)
+    path_m = walk.samples.path_length_m()
+    known = np.isfinite(residual_uT[:, :1])
+    sums = np.cumsum(np.vstack([np.zeros(residual_uT.shape[1] + 1),
+                                np.hstack([np.where(known, residual_uT, 0.0), known])]), axis=0)  # fmt: skip
+    first = np.searchsorted(path_m, path_m - RESIDUAL_OVER_M / 2.0)
+    last = np.searchsorted(path_m, path_m + RESIDUAL_OVER_M / 2.0, side="right")
+    near = sums[last] - sums[first]
+    mean_uT = near[:, :-1] / np.maximum(near[:, -1:], 1.0)
+    return np.where(known[:, 0], np.linalg.norm(mean_uT, axis=1), np.nan)
 
 
 def supporting_walks(

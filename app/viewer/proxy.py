@@ -32,6 +32,13 @@ _MOST_SCENE_BYTES = 64 * 2**20
 
 # The page's controls are not viser's: they ask over HTTP. viser itself is told where the camera is, and nothing else.
 _PASSING = frozenset({"ViewerCameraMessage"})
+# viser makes a client's scene once it knows of a camera. The browser tells its own a second or so after it connects,
+# when it has drawn for the first time; until then this one stands in, so that the scene is on its way already.
+_SOME_CAMERA = msgspec.msgpack.encode({
+    "type": "ViewerCameraMessage", "wxyz": [0.0, 1.0, 0.0, 0.0], "position": [0.0, 0.0, 10.0], "fov": 1.309,
+    "near": 0.01, "far": 1000.0, "image_height": 720, "image_width": 900, "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+})  # fmt: skip
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
@@ -92,6 +99,7 @@ async def relay(browser: WebSocket, upstream_url: str, ended: asyncio.Future[Non
         return False
     async with upstream:
         await browser.accept(subprotocol=upstream.subprotocol)
+        await upstream.send(_SOME_CAMERA)
         towards_viser = asyncio.create_task(_towards_viser(browser, upstream))
         towards_browser = asyncio.create_task(_towards_browser(upstream, browser))
         flows = (towards_viser, towards_browser)

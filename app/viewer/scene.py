@@ -53,7 +53,7 @@ __all__ = [
 
 MAX_POINTS = 300_000
 MAX_ARROWS = 20_000
-_MAX_WALK_SEGMENTS = 60_000
+_MAX_WALK_SEGMENTS = 20_000
 _PLAN_PX = 2048
 _USUAL_ARROWS = 320
 _CLEARANCE_M = 0.04  # lifts lines and arrows off the plane they would otherwise flicker against

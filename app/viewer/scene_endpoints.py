@@ -5,6 +5,7 @@ them.
 """
 
 import asyncio
+import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -21,7 +22,9 @@ from starlette.websockets import WebSocket
 
 from app.errors import Conflict, IsodynError, NotFound
 from app.viewer.asked import Marks, Shown, Target
+from app.viewer.chosen import choose
 from app.viewer.client_scene import ClientScene
+from app.viewer.content import OrganisationContent
 from app.viewer.proxy import CLOSE_SIGNED_OUT, PAGE_POLICY, ViserPage, fetch_page, relay
 from app.viewer.requests import SECURITY_HEADERS, problem, read_json, refusal, same_origin
 from app.viewer.sessions import Session, SignedIn
@@ -29,6 +32,7 @@ from app.viewer.viser_pool import ViserPool
 
 __all__ = ["SceneEndpoints"]
 
+_log = logging.getLogger(__name__)
 _MOST_ASKED_BYTES = 2 * 2**20
 _CONNECTS_WITHIN_S, _LOOKS_EVERY_S = 15.0, 0.05
 _VIEW = re.compile(r"[A-Za-z0-9_-]{8,64}")
@@ -41,12 +45,13 @@ class SceneEndpoints:
     def __init__(self, signed_in: SignedIn, pool: ViserPool, cookie: str) -> None:
         self._signed_in, self._pool, self._cookie = signed_in, pool, cookie
         self._page: ViserPage | None = None
+        self._expected: set[asyncio.Task[ViserPage]] = set()
 
     def routes(self) -> list[BaseRoute]:
         return [
             Route("/scene/{view}", self._frame, methods=["GET"]),
             WebSocketRoute("/scene/{view}", self._connect),
-            Route("/scene/{view}/show", self._asked(Shown, ClientScene.show), methods=["POST"]),
+            Route("/scene/{view}/show", self._asked(Shown, ClientScene.show, ahead=choose), methods=["POST"]),
             Route("/scene/{view}/mark", self._asked(Marks, ClientScene.mark), methods=["POST"]),
             Route("/scene/{view}/pick", self._asked(Target, ClientScene.pick), methods=["POST"]),
             Route("/scene/{view}/camera", self._camera, methods=["GET"]),
@@ -61,14 +66,37 @@ class SceneEndpoints:
             return refusal(HTTPStatus.NOT_FOUND, "a view is named by 8 to 64 letters and digits")
         if request.url.query:
             return RedirectResponse(request.url.path, HTTPStatus.SEE_OTHER, SECURITY_HEADERS)
-        async with self._pool.visit(session.organisation_id) as viewer:
+        try:
+            page = await self._ready(session.organisation_id)
+        except httpx.TransportError:
+            return refusal(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting again; load this page once more")
+        return _page_response(page, request)
+
+    def expect(self, organisation_id: str) -> None:
+        """Somebody of the organisation is about to look: begin to make ready, and wait for nobody."""
+        task = asyncio.create_task(self._ready(organisation_id))
+        self._expected.add(task)
+        task.add_done_callback(self._arrived)
+
+    def _arrived(self, task: asyncio.Task[ViserPage]) -> None:
+        self._expected.discard(task)
+        if not task.cancelled() and task.exception() is not None:
+            _log.warning("the viewer could not be made ready", exc_info=task.exception())
+
+    async def _ready(self, organisation_id: str) -> ViserPage:
+        """The organisation's server started, and viser's page, which is the same for all. Raises TransportError."""
+        async with self._pool.visit(organisation_id) as viewer:
             try:
-                if self._page is None:  # the same for every organisation
+                if self._page is None:
                     self._page = await fetch_page(viewer.http_url)
             except httpx.TransportError:
-                await self._pool.discard(session.organisation_id, viewer)
-                return refusal(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting again; load this page once more")
-        return _page_response(self._page, request)
+                await self._pool.discard(organisation_id, viewer)
+                raise
+        return self._page
+
+    async def close(self) -> None:
+        """Wait for what was begun."""
+        await asyncio.gather(*self._expected, return_exceptions=True)
 
     async def _connect(self, websocket: WebSocket) -> None:
         """The canvas's WebSocket: foreign origins get 403 and nothing else; no session, a close with 4401."""
@@ -91,16 +119,23 @@ class SceneEndpoints:
             ended.cancel()
 
     def _asked(
-        self, model: type[Asked], answer: Callable[[ClientScene, Asked], BaseModel | None]
+        self,
+        model: type[Asked],
+        answer: Callable[[ClientScene, Asked], BaseModel | None],
+        ahead: Callable[[OrganisationContent, Asked], object] | None = None,
     ) -> Callable[[Request], Awaitable[Response]]:
-        """An endpoint that hands a checked body to the scene of its view, and the answer back."""
+        """An endpoint that hands a checked body to the scene of its view, and the answer back.
+
+        ahead: what can be made ready while the canvas is still connecting.
+        """
 
         async def endpoint(request: Request) -> Response:
             if not same_origin(request.headers):
                 return refusal(HTTPStatus.FORBIDDEN, "only this server's own page may ask here")
             try:
                 asked = await read_json(request, model, _MOST_ASKED_BYTES)
-                async with self._scene(request) as scene:
+                make_ready = None if ahead is None else lambda content: ahead(content, asked)
+                async with self._scene(request, make_ready) as scene:
                     return _json(await run_in_threadpool(answer, scene, asked))
             except IsodynError as error:
                 return problem(error)
@@ -115,13 +150,17 @@ class SceneEndpoints:
             return problem(error)
 
     @asynccontextmanager
-    async def _scene(self, request: Request) -> AsyncIterator[ClientScene]:
+    async def _scene(
+        self, request: Request, make_ready: Callable[[OrganisationContent], object] | None = None
+    ) -> AsyncIterator[ClientScene]:
         """The scene of the request's view, waiting for its canvas to connect. Raises NotFound, Conflict."""
         session = await self._session(request)
         view = None if session is None else _view(request.path_params["view"], session)
         if session is None or view is None:
             raise NotFound("there is no such view; sign in again")
         async with self._pool.visit(session.organisation_id) as viewer:
+            if make_ready is not None and view not in viewer.scenes:
+                await run_in_threadpool(make_ready, viewer.content)
             for _ in range(int(_CONNECTS_WITHIN_S / _LOOKS_EVERY_S)):
                 if view in viewer.scenes:
                     yield viewer.scenes[view]

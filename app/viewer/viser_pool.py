@@ -18,10 +18,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlencode, urlsplit
 
+import numpy as np
 from starlette.concurrency import run_in_threadpool
 
 from app.viewer.client_scene import ClientScene
 from app.viewer.content import OrganisationContent, RecentlyUsed
+from app.viewer.layers import ColourScale
 from app.viewer.source import ViewerSource
 from app.viewer.viser_server import LOOPBACK, start_viser, stop_viser
 
@@ -158,6 +160,7 @@ class ViserPool:
             await self.stop_idle()
 
     def _start(self, organisation_id: str) -> OrganisationViewer:
+        ColourScale(0.0, 1.0).rgb(np.zeros(1))  # loads what colours need before the first picture waits for it
         content = OrganisationContent(organisation_id, self._source, self._recent)
         viewer = OrganisationViewer(start_viser(), content, secrets.token_urlsafe(32))
 

@@ -106,6 +106,12 @@ def test_lists_are_paged_by_an_opaque_cursor(service: Any, key_with: Callable[..
         url = page["links"].get("next")
     assert len(seen) == len(set(seen))
     assert [each for each in seen if each in made] == made
+    backwards, url = [], "/v1/buildings?limit=2&order=newest"
+    while url:
+        page = service.http.get(url).json()
+        backwards += [item["id"] for item in page["items"]]
+        url = page["links"].get("next")
+    assert backwards == seen[::-1]
     assert service.http.get("/v1/buildings", params={"cursor": "'; drop"}).status_code == 422
 
 

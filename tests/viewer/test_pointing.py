@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.field.samples import Samples
-from app.viewer.pointing import camera_ray, plane_hit, supporting_walks, walk_residual_uT
+from app.viewer.pointing import camera_ray, kept_upright, plane_hit, supporting_walks, walk_residual_uT
 from app.viewer.source import Walk
 
 LOOKS_DOWN = np.array([0.0, 1.0, 0.0, 0.0])  # x right, y of the picture towards -y of the world, z of the camera down
@@ -30,6 +30,13 @@ def test_a_ray_projects_back_to_where_it_came_from(u, v, fov, aspect, seed):
     assert seen[2] > 0
     assert focal * seen[0] / seen[2] / aspect + 0.5 == pytest.approx(u, abs=1e-9)
     assert focal * seen[1] / seen[2] + 0.5 == pytest.approx(v, abs=1e-9)
+
+
+def test_a_camera_that_looks_straight_down_keeps_its_side_up():
+    position, target = kept_upright(LOOKS_DOWN, np.array([3.0, 4.0, 20.0]), np.array([3.0, 4.0, 0.0]))
+    np.testing.assert_allclose(position, [3.0, 4.0 - 0.02, 20.0])  # from the south: y is up in the picture
+    slanted = np.array([3.0, -9.0, 20.0])
+    assert kept_upright(LOOKS_DOWN, slanted, target)[0] is slanted
 
 
 def test_a_plane_is_hit_ahead_only():

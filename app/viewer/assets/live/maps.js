@@ -3,11 +3,12 @@
 import { byId, make, number, put, told } from "./elements.js";
 import { offer } from "./field.js";
 import { floorName, may, redraw, reload, state } from "./page.js";
-import { all, ask } from "./server.js";
+import { ask } from "./server.js";
 import * as surveys from "./surveys.js";
 
 const OPEN = ["accepted", "running"];
 const watched = new Map();
+let newestAtFirst = null;
 let looking = null;
 
 export function wire() {
@@ -23,17 +24,17 @@ export function wire() {
     }
     return null;
   });
-  setInterval(findJobs, 10000);
+  setInterval(findJobs, 3000);
   findJobs();
 }
 
-/** Jobs that somebody else started are found, too. */
+/** Jobs that somebody else started are found, too: those still open, and those that ended since the page was opened. */
 async function findJobs() {
   if (document.hidden) return;
-  for (const status of OPEN) {
-    const page = await ask("GET", `v1/jobs?status=${status}`).catch(() => ({ items: [] }));
-    for (const job of page.items) if (!watched.has(job.id)) watch(job);
-  }
+  const page = await ask("GET", "v1/jobs?order=newest&limit=8").catch(() => ({ items: [] }));
+  newestAtFirst ??= page.items[0]?.id ?? "";
+  const fresh = page.items.filter((job) => OPEN.includes(job.status) || job.id > newestAtFirst); // ids sort by time
+  for (const job of fresh.reverse()) if (!watched.has(job.id)) watch({ ...job, status: "running" });
 }
 
 /** Follow a job to its end with a progress bar; then show what it made. */
@@ -89,11 +90,11 @@ export async function refresh() {
     return;
   }
   try {
-    const maps = (await all(`v1/floors/${floor}/maps`)).reverse();
+    const maps = (await ask("GET", `v1/floors/${floor}/maps?order=newest&limit=30`)).items;
     if (floor !== state.floor) return;
     const ready = maps.filter((map) => map.status === "ready");
     state.versions = Object.fromEntries(ready.map((map) => [map.id, title(map)]));
-    put(byId("map-list"), ...(maps.length ? maps.slice(0, 30).map(item) : [make("p", { className: "soft" }, "There is none yet.")]));
+    put(byId("map-list"), ...(maps.length ? maps.map(item) : [make("p", { className: "soft" }, "There is none yet.")]));
     offer(state);
   } catch (error) {
     put(byId("map-list"), told(error));

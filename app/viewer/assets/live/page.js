@@ -5,7 +5,7 @@ import { describe, offer, readPlace, showPicked, showTip } from "./field.js";
 import * as maps from "./maps.js";
 import * as plans from "./plans.js";
 import * as positions from "./positions.js";
-import { camera, openCanvas, show, watchPointer } from "./scene.js";
+import { camera, show, watchPointer } from "./scene.js";
 import { ask } from "./server.js";
 import * as surveys from "./surveys.js";
 
@@ -40,6 +40,7 @@ export function redraw(cameraWish = "keep") {
     building_id: state.building, floor_id: state.floor, map_id: state.map, versus_id: state.versus, layer: state.layer,
     height_m: state.height, arrows: state.arrows, walks: state.walks, outline: state.outline, plan: state.plan,
     separation_m: state.separation, camera: cameraWish,
+    aspect: Math.min(10, Math.max(0.1, byId("stage").clientWidth / byId("stage").clientHeight)),
   };
   return show(wanted, drawn, (error) => put(byId("notes"), told(error)));
 }
@@ -84,7 +85,7 @@ function remember() {
 async function rememberCamera() {
   const seen = await camera().catch(() => null);
   if (!seen) return;
-  state.cameraText = [...seen.position_m, ...seen.look_at_m].map((v) => v.toFixed(2)).join(",");
+  state.cameraText = [...seen.position_m, ...seen.look_at_m].map((v) => Number(v.toFixed(4))).join(",");
   remember();
 }
 
@@ -172,12 +173,8 @@ function wireSession() {
 }
 
 async function start() {
-  openCanvas();
   wire();
   state.content = await ask("GET", "content");
-  if (state.content.buildings.length === 0) {
-    put(byId("notes"), told("There are no buildings yet. Make one with POST /v1/buildings, or run the demo; then survey it.", "warn"));
-  }
   positions.wire();
   surveys.wire();
   maps.wire();

@@ -3,11 +3,8 @@
 import { ask } from "./server.js";
 import { byId } from "./elements.js";
 
-const view = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
-const path = `scene/${view}`;
 const frame = byId("canvas");
-
-export const openCanvas = () => { frame.src = path; };
+const path = frame.getAttribute("src"); // names a view of this page's own
 export const mark = (marks) => ask("POST", `${path}/mark`, { json: marks });
 export const camera = () => ask("GET", `${path}/camera`);
 const pick = (target) => ask("POST", `${path}/pick`, { json: target });
@@ -43,7 +40,7 @@ async function drain() {
 
 /** Watch the pointer over the canvas: `hovered(picked, x, y)` when it rests, `clicked(picked)`, `moved()` after a drag. */
 export function watchPointer({ hovered, clicked, moved }) {
-  frame.addEventListener("load", () => {
+  const watch = () => {
     const inside = frame.contentWindow;
     let resting = null;
     let down = null;
@@ -71,7 +68,9 @@ export function watchPointer({ hovered, clicked, moved }) {
     }, true);
     let turning = null;
     inside.addEventListener("wheel", () => { clearTimeout(turning); turning = setTimeout(moved, 500); }, { passive: true });
-  });
+  };
+  frame.addEventListener("load", watch);
+  if (frame.contentDocument?.readyState === "complete" && frame.contentWindow.location.href !== "about:blank") watch();
 }
 
 const clamp = (value) => Math.min(1, Math.max(0, value));
