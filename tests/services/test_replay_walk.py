@@ -191,7 +191,7 @@ def test_a_walk_shorter_than_a_window_is_refused(floor: SearchableFloor, x_m: Ar
 def test_a_phone_that_counted_no_steps_is_told_so(floor: SearchableFloor, traced: Walk) -> None:
     assert traced.dead_reckoning is not None
     still = replace(traced.dead_reckoning, displacement_m=0.0 * traced.dead_reckoning.displacement_m)
-    with pytest.raises(InvalidInput, match="by the device's own steps the walk is 0.0 m long"):
+    with pytest.raises(InvalidInput, match=r"by the device's own steps the walk is 0\.0 m long"):
         replay_walk(replace(traced, dead_reckoning=still), [floor], 10.0, 2.0)
 
 
