@@ -1,6 +1,5 @@
 """Surveys as Parquet, read from memory."""
 
-
 from app.errors import Fault, UnreadableSurvey
 from app.field.samples import SampleFrame
 from app.geometry import Array
