@@ -11,6 +11,7 @@
 | unavailable  | 503 | the database or the blob store cannot be reached                                          |
 """
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,6 +37,7 @@ from app.errors import (
 
 __all__ = ["ERROR_RESPONSES", "Forbidden", "Problem", "Unauthorised", "add_problem_handlers", "problem_response"]
 
+_log = logging.getLogger(__name__)
 TYPE_BASE = "https://isodyn.dev/problems/"
 UNION_TAGS = frozenset({"vectors", "magnitudes"})  # of a window's b_ut: no part of a JSON pointer
 
@@ -127,9 +129,17 @@ def isodyn_problem(error: IsodynError) -> JSONResponse:
     return problem_response(status, kind, title, str(error), error.faults, headers)
 
 
-async def _isodyn_error(_: Request, error: Exception) -> JSONResponse:
+async def _isodyn_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, IsodynError)
-    return isodyn_problem(error)
+    answer = isodyn_problem(error)
+    if answer.status_code >= 500:
+        _tell_the_log(request, error)
+    return answer
+
+
+def _tell_the_log(request: Request, error: Exception) -> None:
+    """A fault of ours that is answered: the server, which logs what nobody handles, never hears of it."""
+    _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
 
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
@@ -155,16 +165,18 @@ async def _http_exception(_: Request, error: Exception) -> JSONResponse:
     )
 
 
-async def _database_unavailable(_: Request, error: Exception) -> JSONResponse:
+async def _database_unavailable(request: Request, error: Exception) -> JSONResponse:
+    _log.warning("%s %s: the database cannot be reached: %s", request.method, request.url.path, error)
     detail = "the database cannot be reached now; nothing was stored, try again"
     return problem_response(503, "unavailable", "Unavailable", detail, headers={"Retry-After": "5"})
 
 
-async def _database_refused(_: Request, error: Exception) -> JSONResponse:
+async def _database_refused(request: Request, error: Exception) -> JSONResponse:
+    _tell_the_log(request, error)
     return problem_response(500, "internal", "Something went wrong here", "the database refused the statement")
 
 
 async def _unexpected(_: Request, error: Exception) -> JSONResponse:
-    """A fault of ours: the server's log has the traceback."""
+    """A fault of ours: it is raised on after the answer, and the server logs it with its traceback."""
     detail = f"an unexpected {type(error).__name__}; the server's log says more, please report it"
     return problem_response(500, "internal", "Something went wrong here", detail)

@@ -1,28 +1,31 @@
 """Replay a walk against a floor's map: window after window, beside where it was. Nothing is stored."""
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
-from app.api.auth import Locating
+from app.api.auth import Identity, Locating
 from app.api.body import read_upload
-from app.api.context import ContextDep
+from app.api.context import Context, ContextDep
+from app.api.floors import find_floor
 from app.api.models import Finite, Id
 from app.api.problems import ERROR_RESPONSES
 from app.api.surveys import SURVEY_FILES, SurveyFormat
 from app.errors import Conflict
-from app.positioning.locate import SearchableFloor
-from app.services.locate_window import active_maps
+from app.services.locate_window import ActiveMap, active_maps
+from app.services.receive_survey import read_on_floor
 from app.services.replay_walk import Replay, ReplayedFix, replay_walk
-from app.survey.read import read_survey
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["locate"], responses=ERROR_RESPONSES)
+MOST_PATH_POINTS = 2000
 
 
 class ReplayedPath(BaseModel):
@@ -69,26 +72,37 @@ async def replay(
     window_m: Annotated[Finite, Query(ge=1, le=200, description="length of a window, walked")] = 10.0,
     every_m: Annotated[Finite, Query(ge=0.2, le=200, description="from one window to the next")] = 2.0,
 ) -> StreamingResponse:
-    """The walk is read as a survey would be and never stored. Windows are asked without a prior, on this floor."""
+    """The walk is read as a survey would be and never stored. Windows are asked without a prior, on this floor, and
+    take their turn with those of others; a client that goes away ends the work."""
+    elevation_m, maps = await run_in_threadpool(_floor_and_maps, context, identity, floor_id)
     data = await read_upload(request, context.settings.max_upload_bytes)
 
     def begin() -> Replay:
-        with context.engine.connect() as connection:
-            maps = active_maps(connection, identity.organisation_id, floor_ids=[floor_id])
-        if not maps:
-            raise Conflict(f"floor {floor_id} has no map yet; upload surveys and wait for its job")
-        floors: list[SearchableFloor] = context.grids.searchable([(m.floor_id, m.grid_sha256) for m in maps])
-        return replay_walk(read_survey(data, format=format, frame=frame), floors, window_m, every_m)
+        walk = read_on_floor(data, format=format, frame=frame, elevation_m=elevation_m)
+        floors = context.grids.searchable([(each.floor_id, each.grid_sha256) for each in maps])
+        return replay_walk(walk, floors, window_m, every_m)
 
     begun = await run_in_threadpool(begin)
-    return StreamingResponse(_lines(floor_id, begun), media_type="application/x-ndjson")
+    return StreamingResponse(_lines(context, floor_id, begun), media_type="application/x-ndjson")
 
 
-def _lines(floor_id: str, begun: Replay) -> Iterator[str]:
-    stride = -(-len(begun.path_m) // 2000)
-    yield _line(ReplayedPath(floor_id=floor_id, path_m=begun.path_m[::stride].tolist(), windows=begun.windows))
-    for fix in begun.fixes:
-        yield _line(_shown(fix))
+def _floor_and_maps(context: Context, identity: Identity, floor_id: str) -> tuple[float, list[ActiveMap]]:
+    """The floor's elevation and its active map. Raises NotFound, Conflict."""
+    with context.transaction() as session:
+        elevation_m = find_floor(session, identity, floor_id).elevation_m
+        maps = active_maps(session.connection(), identity.organisation_id, floor_ids=[floor_id])
+    if not maps:
+        raise Conflict(f"floor {floor_id} has no map yet; upload surveys and wait for its job")
+    return elevation_m, maps
+
+
+async def _lines(context: Context, floor_id: str, begun: Replay) -> AsyncIterator[str]:
+    shown = np.linspace(0, len(begun.path_m) - 1, min(len(begun.path_m), MOST_PATH_POINTS)).astype(int)
+    yield _line(ReplayedPath(floor_id=floor_id, path_m=begun.path_m[shown].tolist(), windows=begun.windows))
+    lines = (_line(_shown(fix)) for fix in begun.fixes)
+    loop = asyncio.get_running_loop()
+    while line := await loop.run_in_executor(context.searches, lambda: next(lines, None)):
+        yield line
 
 
 def _shown(replayed: ReplayedFix) -> ReplayedWindow:

@@ -19,7 +19,7 @@ from app.services.artefacts import samples_to_bytes
 from app.survey.read import read_survey
 from app.survey.walk import Walk
 
-__all__ = ["ParsedSurvey", "find_replaced", "parse_survey", "record_survey", "was_replaced"]
+__all__ = ["ParsedSurvey", "find_replaced", "parse_survey", "read_on_floor", "record_survey", "was_replaced"]
 
 DEVICE_HEIGHT_FORMATS = frozenset({"indoor-location-2020"})  # their z is height above the slab, not building z
 
@@ -50,8 +50,8 @@ def parse_survey(
     session: str | None = None,
 ) -> ParsedSurvey:
     """Read a survey file and store its bytes and its samples. Raises UnreadableSurvey; then nothing is stored."""
-    walk = read_survey(data, format=format, frame=frame, session=session)
-    samples = _raise_to_floor(walk, elevation_m).samples if format in DEVICE_HEIGHT_FORMATS else walk.samples
+    walk = read_on_floor(data, format=format, frame=frame, session=session, elevation_m=elevation_m)
+    samples = walk.samples
     return ParsedSurvey(
         format=format,
         frame=samples.frame,
@@ -63,6 +63,18 @@ def parse_survey(
         session=session,
         elevation_m=elevation_m,
     )
+
+
+def read_on_floor(
+    data: bytes, *, format: str, frame: SampleFrame, elevation_m: float, session: str | None = None
+) -> Walk:
+    """The walk in a survey file, in building metres on a floor whose slab is at `elevation_m`. Raises UnreadableSurvey,
+    TooLarge."""
+    walk = read_survey(data, format=format, frame=frame, session=session)
+    if format not in DEVICE_HEIGHT_FORMATS:
+        return walk
+    lifted_m = walk.samples.p_building_m + np.array([0.0, 0.0, elevation_m])
+    return replace(walk, samples=replace(walk.samples, p_building_m=lifted_m))
 
 
 def record_survey(
@@ -146,8 +158,3 @@ def _new_survey(floor: Floor, parsed: ParsedSurvey, replaces: str | None) -> Sur
 def latest_job(session: Session, floor_id: str) -> Job | None:
     """The floor's most recent job."""
     return session.scalars(select(Job).where(Job.floor_id == floor_id).order_by(Job.id.desc()).limit(1)).first()
-
-
-def _raise_to_floor(walk: Walk, elevation_m: float) -> Walk:
-    lifted = walk.samples.p_building_m + np.array([0.0, 0.0, elevation_m])
-    return replace(walk, samples=replace(walk.samples, p_building_m=lifted))

@@ -6,6 +6,7 @@ may carry one column, `b_ut` or `bx_ut`, instead of three.
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,15 @@ from app.field.samples import SampleFrame, Samples
 from app.geometry import Array, rotate_by_quaternion
 from app.survey.units import field_faults
 
-__all__ = ["MAX_FAULTS", "MAX_SAMPLES", "Columns", "check_sample_count", "columns_to_read", "samples_from_columns"]
+__all__ = [
+    "MAX_FAULTS",
+    "MAX_SAMPLES",
+    "Columns",
+    "check_sample_count",
+    "columns_to_read",
+    "numbers_of",
+    "samples_from_columns",
+]
 
 MAX_SAMPLES = 2_000_000
 """Most samples in one survey: eleven columns of that many doubles are 176 MB."""
@@ -81,6 +90,13 @@ def columns_to_read(found: Collection[str], frame: SampleFrame) -> tuple[str, ..
             Fault("header", f"missing {', '.join(missing)}; found {names}"),
         )
     return wanted
+
+
+def numbers_of(column: Any) -> Array:
+    """An Arrow column of doubles; nulls become NaN. Arrow's own `to_numpy` would load pandas, where that is installed:
+    a second that the first upload waits for."""
+    whole = column if column.null_count == 0 else column.fill_null(np.nan)
+    return np.array(np.from_dlpack(whole.combine_chunks()))
 
 
 def samples_from_columns(columns: Columns, frame: SampleFrame) -> tuple[Samples, list[str]]:

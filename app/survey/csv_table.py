@@ -8,7 +8,7 @@ import numpy as np
 
 from app.errors import Fault, UnreadableSurvey
 from app.field.samples import SampleFrame
-from app.survey.columns import MAX_FAULTS, Columns, check_sample_count, columns_to_read
+from app.survey.columns import MAX_FAULTS, Columns, check_sample_count, columns_to_read, numbers_of
 
 __all__ = ["read_csv"]
 
@@ -81,7 +81,7 @@ def _read_fast(text: str, first: int, header: list[str], wanted: tuple[str, ...]
         )
     except (pa.ArrowException, ValueError):
         return None
-    values = {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in wanted}
+    values = {name: numbers_of(table.column(name)) for name in wanted}
     return Columns(values, _LineNumbers(text))
 
 

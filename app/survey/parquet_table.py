@@ -1,11 +1,9 @@
 """Surveys as Parquet, read from memory."""
 
-import numpy as np
-
 from app.errors import Fault, UnreadableSurvey
 from app.field.samples import SampleFrame
 from app.geometry import Array
-from app.survey.columns import Columns, check_sample_count, columns_to_read
+from app.survey.columns import Columns, check_sample_count, columns_to_read, numbers_of
 
 __all__ = ["read_parquet"]
 
@@ -41,7 +39,7 @@ def read_parquet(data: bytes, frame: SampleFrame) -> Columns:
     values: dict[str, Array] = {}
     for name in wanted:
         # Nulls become NaN, which the common checks then refuse with row and column.
-        values[name] = np.asarray(table.column(name).cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
+        values[name] = numbers_of(table.column(name).cast(pa.float64(), safe=False))
     return Columns(values, lambda i: f"row {i + 1}")
 
 

@@ -1,6 +1,7 @@
 """A real application on a real database and blob folder, both kinds of database, without a worker process: jobs are
 run by calling the worker's own verbs. `tests/end_to_end` has the same with every process."""
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from fastapi import FastAPI
 from sqlalchemy import select
 from starlette.testclient import TestClient
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app.api.context import Context
 from app.db.tables import Base, Job
@@ -77,6 +79,20 @@ class Service:
         return sum(path.is_file() for path in (self.context.settings.data_dir / "blobs").rglob("*"))
 
 
+class Logged:
+    """Errors that nobody handles go to the log, as a server has them; the test client drops them without a word."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self.app(scope, receive, send)
+        except Exception:
+            logging.getLogger("tests.api").exception("%s %s failed", scope.get("method"), scope.get("path"))
+            raise
+
+
 @pytest.fixture(scope="module")
 def service(database_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     folder: Path = tmp_path_factory.mktemp("data")
@@ -88,7 +104,7 @@ def service(database_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iter
     context: Context = app.state.context
     with context.transaction() as session:
         create_key(session, organisation="another", name="stranger", scopes=["admin"], secret=STRANGER)
-    with TestClient(app, headers={"Authorization": f"Bearer {ADMIN}"}, raise_server_exceptions=False) as http:
+    with TestClient(Logged(app), headers={"Authorization": f"Bearer {ADMIN}"}, raise_server_exceptions=False) as http:
         yield Service(http, app, context)
 
 

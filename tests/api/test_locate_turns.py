@@ -96,6 +96,26 @@ def test_a_single_window_comes_between_those_of_a_batch(
     assert sum(looked < at for looked in looked_up) < 60, "the single window waited for most of the batch"
 
 
+def test_a_replay_takes_its_turn_window_by_window(
+    service: Any, mapped_floor: str, clients: ThreadPoolExecutor, walk_csv: Any
+) -> None:
+    def ask(path: str, **body: Any) -> tuple[int, int, float]:
+        answer = service.http.post(f"/v1/floors/{mapped_floor}/{path}", **body)
+        return answer.status_code, len(answer.text.splitlines()), time.perf_counter()
+
+    with occupied(service, SEARCH_THREADS) as enough:
+        replayed = clients.submit(ask, "replay?every_m=1", content=walk_csv(9))
+        assert not wait([replayed], timeout=1.0).done, "it waits like any window"
+        single = clients.submit(ask, "locate", json=BODY)
+        assert not wait([single], timeout=0.5).done
+        assert service.http.get("/healthz").status_code == 200
+        enough.set()
+        status, _, at = single.result(timeout=60)
+        replay_status, lines, replayed_at = replayed.result(timeout=120)
+    assert (status, replay_status, lines > 50) == (200, 200, True)
+    assert at < replayed_at, "the single window waited for all of the replay"
+
+
 def test_what_another_process_changes_counts_at_once(service: Any, mapped_floor: str, active_map: str) -> None:
     """Nothing about floors and their active maps is remembered from one window to the next."""
 

@@ -1,6 +1,8 @@
 """Canonical surveys: three formats with one meaning, and a reason for every refusal."""
 
 import contextlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -367,3 +369,16 @@ def test_damaged_files_never_break_a_reader(table, writers, edits, cut):
         if cut < 0.3:
             del data[int(cut / 0.3 * len(data)) :]
         read_or_refuse(bytes(data), format)
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet"])
+def test_a_first_survey_does_not_wait_for_pandas(table, writers, format):
+    """Arrow would load it to hand over a column, where it is installed, in the thread that answers the upload."""
+    reading = (
+        "import sys\n"
+        "from app.survey.read import read_survey\n"
+        f"read_survey(sys.stdin.buffer.read(), format={format!r})\n"
+        "sys.exit('pandas' in sys.modules)"
+    )
+    data = writers[format](plain(table))
+    assert subprocess.run([sys.executable, "-c", reading], input=data, timeout=120, check=False).returncode == 0
