@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["CameraPose", "Ellipse", "Likelihood", "Marks", "Mode", "Path", "Shown", "Target"]
+__all__ = ["ASKED_BY", "CameraPose", "Ellipse", "Likelihood", "Marks", "Mode", "Path", "Shown", "Target"]
 
 Id = Annotated[str, Field(max_length=64)]
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
@@ -48,6 +48,11 @@ class Shown(_Asked):
     separation_m: Annotated[float, Field(ge=0, le=100)] | None = None
     camera: Literal["keep", "oblique", "top"] | CameraPose = "keep"
     aspect: Annotated[float, Field(ge=0.1, le=10)] = 1.3
+
+
+ASKED_BY = {"building": "building_id", "floor": "floor_id", "map": "map_id", "versus": "versus_id", "layer": "layer",
+            "height": "height_m"}  # fmt: skip
+"""The fields of `Shown` by their names in a deep link."""
 
 
 class Target(_Asked):

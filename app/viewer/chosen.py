@@ -12,7 +12,8 @@ from app.viewer.asked import Shown
 from app.viewer.floor_scene import ShownFloor
 from app.viewer.layers import LAYERS
 from app.viewer.picture import OfferedLayer, offered_layers
-from app.viewer.source import ViewedBuilding, ViewedFloor
+from app.viewer.scene import walks_hide_the_field
+from app.viewer.source import ViewedBuilding, ViewedFloor, Walk
 
 if TYPE_CHECKING:
     from app.viewer.content import OrganisationContent
@@ -27,6 +28,7 @@ class Chosen:
     layer, layers      the one shown, and those every shown map has
     height_m, heights_m  of the map with the most heights; None without a map
     notes              what was asked for and is not shown, and why
+    walks              whether the walks are drawn
     """
 
     building_id: str | None
@@ -37,6 +39,7 @@ class Chosen:
     height_m: float | None
     heights_m: tuple[float, ...]
     notes: tuple[str, ...]
+    walks: bool
 
     @property
     def stage(self) -> tuple[object, ...]:
@@ -71,9 +74,14 @@ def choose(content: OrganisationContent, asked: Shown) -> Chosen:
     height_m = min(
         heights, key=lambda z: abs(z - (heights[0] if asked.height_m is None else asked.height_m)), default=None
     )
-    shown = tuple(_shown(content, b, layer, height_m if one else None, versus) for b in bare)
+    walks = [content.walks(floor.id) for floor in floors]
+    with_walks = asked.walks
+    if with_walks is None:
+        with_walks = not walks_hide_the_field([w for each in walks for w in each], [m.grid for m in maps if m])
+    draw = _Drawing(content, layer, height_m if one else None, versus, with_walks)
+    shown = tuple(draw.floor(b, each) for b, each in zip(bare, walks, strict=True))
     return Chosen(building.id if building else None, floors[0].id if one else None, shown, layer, layers,
-                  height_m, heights, tuple(notes))  # fmt: skip
+                  height_m, heights, tuple(notes), with_walks)  # fmt: skip
 
 
 def _floors(
@@ -131,13 +139,20 @@ def _layer(wanted: str, layers: list[OfferedLayer], notes: list[str]) -> str:
     return "norm"
 
 
-def _shown(
-    content: OrganisationContent, floor: ShownFloor, layer: str, height_m: float | None, versus_id: str | None
-) -> ShownFloor:
-    walks = content.walks(floor.floor.id)
-    if floor.grid is None or floor.map_id is None:
-        return ShownFloor(floor.floor, walks)
-    k = 0 if height_m is None else int(np.argmin(np.abs(floor.grid.heights_m - height_m)))
-    values = content.layer(floor.map_id, layer, k, versus_id)
-    residuals_uT = content.residuals_uT(floor.map_id, walks)
-    return ShownFloor(floor.floor, walks, floor.map_id, floor.grid, values, k, residuals_uT)
+@dataclass(frozen=True, slots=True)
+class _Drawing:
+    """What is drawn of every floor."""
+
+    content: OrganisationContent
+    layer: str
+    height_m: float | None
+    versus_id: str | None
+    with_walks: bool
+
+    def floor(self, floor: ShownFloor, walks: list[Walk]) -> ShownFloor:
+        if floor.grid is None or floor.map_id is None:
+            return ShownFloor(floor.floor, walks)
+        k = 0 if self.height_m is None else int(np.argmin(np.abs(floor.grid.heights_m - self.height_m)))
+        values = self.content.layer(floor.map_id, self.layer, k, self.versus_id)
+        residuals_uT = self.content.residuals_uT(floor.map_id, walks) if self.with_walks else ()
+        return ShownFloor(floor.floor, walks, floor.map_id, floor.grid, values, k, residuals_uT)

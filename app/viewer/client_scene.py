@@ -57,8 +57,7 @@ class ClientScene:
         """Draw what is asked for. Raises InvalidInput for a layer there is none of."""
         with self._lock:
             chosen = choose(self._content, asked)
-            if asked.walks is None:
-                asked = asked.model_copy(update={"walks": not _walks_hide_the_field(chosen)})
+            asked = asked.model_copy(update={"walks": chosen.walks})
             same_floors = self._chosen is not None and chosen.stage == self._chosen.stage
             with self._client.atomic():
                 if not same_floors:
@@ -262,11 +261,6 @@ class ClientScene:
             layer_value=float(values[j, i]) if np.isfinite(values[j, i]) else None,
             surveys=_supports(floor, point_m) if surveys else None,
         )  # fmt: skip
-
-
-def _walks_hide_the_field(chosen: Chosen) -> bool:
-    grids = [floor.grid for floor in chosen.floors if floor.grid is not None]
-    return draw.walks_hide_the_field([walk for floor in chosen.floors for walk in floor.walks], grids)
 
 
 def _supports(floor: ShownFloor, point_m: Array) -> list[SupportView]:

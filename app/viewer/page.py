@@ -19,8 +19,10 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.routing import BaseRoute, Route, Router
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.errors import TooLarge
+from app.errors import InvalidInput, TooLarge
 from app.viewer.api_door import ApiDoor
+from app.viewer.asked import ASKED_BY, Shown
+from app.viewer.poster import poster_png
 from app.viewer.requests import SECURITY_HEADERS, read_form, refusal, same_origin
 from app.viewer.scene_endpoints import SceneEndpoints
 from app.viewer.sessions import Session, SignedIn
@@ -82,6 +84,7 @@ class ViewerApp:
             Route("/sign-out", self._sign_out, methods=["POST"]),
             Route("/assets/{name}", self._asset, methods=["GET"]),
             Route("/content", self._content, methods=["GET"]),
+            Route("/poster.png", self._poster, methods=["GET"]),
         ]
 
     async def close(self) -> None:
@@ -168,6 +171,22 @@ class ViewerApp:
         return JSONResponse(
             {"scopes": sorted(session.scopes), "buildings": shown}, headers={"Cache-Control": "no-store"}
         )
+
+    async def _poster(self, request: Request) -> Response:
+        """What a deep link asks for, from above: the picture until the canvas has drawn. 204 without a map."""
+        session = await self._session(request)
+        if session is None:
+            return refusal(HTTPStatus.UNAUTHORIZED, "sign in again")
+        link = _link(request.query_params)
+        try:
+            asked = Shown.model_validate({ASKED_BY[name]: link[name] for name in ASKED_BY if name in link})
+            png = await run_in_threadpool(poster_png, self.pool.content(session.organisation_id), asked)
+        except (ValueError, InvalidInput):
+            png = None
+        headers = {**SECURITY_HEADERS, "Cache-Control": "no-store"}
+        if png is None:
+            return Response(status_code=HTTPStatus.NO_CONTENT, headers=headers)
+        return Response(png, headers=headers, media_type="image/png")
 
     async def _session(self, request: Request) -> Session | None:
         return await self.signed_in.find(request.cookies.get(COOKIE))

@@ -105,6 +105,10 @@ class ViserPool:
         self._lock = asyncio.Lock()
         self._sweeper: asyncio.Task[None] | None = None
 
+    def content(self, organisation_id: str) -> OrganisationContent:
+        """What the organisation's viewer can reach, whether its server runs or not."""
+        return OrganisationContent(organisation_id, self._source, self._recent)
+
     def running(self) -> dict[str, OrganisationViewer]:
         """The servers running now, by organisation."""
         return dict(self._viewers)
@@ -161,8 +165,7 @@ class ViserPool:
 
     def _start(self, organisation_id: str) -> OrganisationViewer:
         ColourScale(0.0, 1.0).rgb(np.zeros(1))  # loads what colours need before the first picture waits for it
-        content = OrganisationContent(organisation_id, self._source, self._recent)
-        viewer = OrganisationViewer(start_viser(), content, secrets.token_urlsafe(32))
+        viewer = OrganisationViewer(start_viser(), self.content(organisation_id), secrets.token_urlsafe(32))
 
         def welcome(client: ClientHandle) -> None:
             try:

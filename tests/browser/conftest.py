@@ -19,23 +19,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from app.cli.demo.synthetic import synthetic_world
 from app.cli.demo.world import World
 
-CHROMIUM = Path("/usr/bin/chromium")
 GALLERY = Path(__file__).parents[2] / "docs" / "pictures"
 KEY = "isd_browser-tests"
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    missing = not CHROMIUM.exists() and "CI" not in os.environ
-    for item in items:
-        if Path(__file__).parent in item.path.parents:
-            item.add_marker(pytest.mark.browser)
-            if missing:
-                item.add_marker(pytest.mark.skip(reason=f"no browser at {CHROMIUM}"))
 
 
 @dataclass
@@ -126,17 +116,6 @@ def _wait_for(seen: Callable[[], bool], told: Callable[[], str], seconds: float 
             pass
         time.sleep(0.1)
     raise AssertionError(told())
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    arguments = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-                 "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
-                 "--enable-unsafe-swiftshader"]  # fmt: skip
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield browser
-        browser.close()
 
 
 class Seat:

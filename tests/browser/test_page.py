@@ -12,6 +12,8 @@ from playwright.sync_api import expect
 
 from tests.browser.conftest import colourful_share
 
+pytestmark = pytest.mark.browser
+
 
 def test_a_wrong_key_is_told_so_and_a_right_one_sees_the_building(seat, town):
     me = seat()
@@ -184,6 +186,7 @@ def test_a_link_shows_the_same_to_somebody_else(seat, town):
     me.page.get_by_role("button", name="From above").click()
     me.page.mouse.move(450, 360)
     me.page.mouse.wheel(0, -600)
+    me.page.mouse.move(1100, 400)  # off the canvas, so that nothing is said about a place
     seen = me.settled()
     me.page.get_by_role("button", name="Copy link").click()
     expect(me.page.locator("#notes")).to_contain_text("link")

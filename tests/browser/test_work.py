@@ -3,7 +3,10 @@
 import gzip
 import re
 
+import pytest
 from playwright.sync_api import expect
+
+pytestmark = pytest.mark.browser
 
 
 def test_a_dropped_survey_becomes_part_of_the_map_and_can_be_left_out_again(seat, town):

@@ -4,14 +4,13 @@ These tests fail when a new viser no longer lets its scene be steered as `app/vi
 """
 
 import io
-import os
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from app.field.grid import FieldGrid
 from app.services.export_map import export_map
@@ -19,24 +18,9 @@ from app.viewer.layers import layer_names
 from app.viewer.notebook import show_map
 from app.viewer.static_view import static_view_html
 
-CHROMIUM = Path("/usr/bin/chromium")
 SCENE_READY = "#isodyn-controls:not([disabled])"
 RING = np.array([[99.5, 39.5], [124.5, 39.5], [124.5, 54.5], [99.5, 54.5]])
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(not CHROMIUM.exists() and "CI" not in os.environ, reason=f"no browser at {CHROMIUM}"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    arguments = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-                 "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
-                 "--enable-unsafe-swiftshader"]  # fmt: skip
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield browser
-        browser.close()
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import { describe, offer, readPlace, showPicked, showTip } from "./field.js";
 import * as maps from "./maps.js";
 import * as plans from "./plans.js";
 import * as positions from "./positions.js";
-import { camera, show, watchPointer } from "./scene.js";
+import { camera, show, showPoster, watchPointer } from "./scene.js";
 import { ask } from "./server.js";
 import * as surveys from "./surveys.js";
 
@@ -173,6 +173,7 @@ function wireSession() {
 }
 
 async function start() {
+  showPoster();
   wire();
   state.content = await ask("GET", "content");
   positions.wire();

@@ -5,6 +5,21 @@ import { byId } from "./elements.js";
 
 const frame = byId("canvas");
 const path = frame.getAttribute("src"); // names a view of this page's own
+/** While the canvas starts, the map from above; it goes once the canvas has drawn what it was first asked for. */
+export function showPoster() {
+  const poster = byId("poster");
+  poster.addEventListener("load", () => { poster.hidden = poster.classList.contains("gone"); });
+  poster.src = `poster.png${location.search}`;
+}
+
+function hidePoster() {
+  const poster = byId("poster");
+  if (poster.classList.contains("gone")) return;
+  const next = (act) => frame.contentWindow.requestAnimationFrame(act);
+  const go = () => { poster.classList.add("gone"); setTimeout(() => { poster.hidden = true; }, 400); };
+  setTimeout(() => next(() => next(() => next(go))), 200); // what was sent has then been drawn
+}
+
 export const mark = (marks) => ask("POST", `${path}/mark`, { json: marks });
 export const camera = () => ask("GET", `${path}/camera`);
 const pick = (target) => ask("POST", `${path}/pick`, { json: target });
@@ -27,6 +42,7 @@ async function drain() {
       waiting = null;
       try {
         drawn(await ask("POST", `${path}/show`, { json: asked }));
+        hidePoster();
       } catch (error) {
         failed(error);
       }
