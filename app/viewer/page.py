@@ -49,6 +49,7 @@ class ViewerApp:
     api                the application that answers `/v1/...`; without one the page can look, and change nothing
     session_seconds    how long a sign-in lasts
     idle_seconds       how long an organisation's viser server outlives its last visitor
+    connect_seconds    how long a request waits for the canvas of its page
 
     Call `await close()` when the application stops.
     """
@@ -61,6 +62,7 @@ class ViewerApp:
         api: ASGIApp | None = None,
         session_seconds: float = 8 * 3600.0,
         idle_seconds: float = 600.0,
+        connect_seconds: float = 15.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.signed_in = SignedIn(authenticate, session_seconds, clock)
@@ -68,7 +70,7 @@ class ViewerApp:
         self._source = source
         self._session_seconds = session_seconds
         self._assets = _read_assets()
-        self._scenes = SceneEndpoints(self.signed_in, self.pool, COOKIE)
+        self._scenes = SceneEndpoints(self.signed_in, self.pool, COOKIE, connect_seconds)
         self._router = Router([*self._routes(), *self._scenes.routes()], redirect_slashes=False)
         if api is not None:
             self._router.mount("/v1", ApiDoor(api, self.signed_in, COOKIE))

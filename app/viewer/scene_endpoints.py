@@ -34,7 +34,7 @@ __all__ = ["SceneEndpoints"]
 
 _log = logging.getLogger(__name__)
 _MOST_ASKED_BYTES = 2 * 2**20
-_CONNECTS_WITHIN_S, _LOOKS_EVERY_S = 15.0, 0.05
+_LOOKS_EVERY_S = 0.05
 _VIEW = re.compile(r"[A-Za-z0-9_-]{8,64}")
 Asked = TypeVar("Asked", bound=BaseModel)
 
@@ -42,8 +42,9 @@ Asked = TypeVar("Asked", bound=BaseModel)
 class SceneEndpoints:
     """Routes below `/scene/{view}`."""
 
-    def __init__(self, signed_in: SignedIn, pool: ViserPool, cookie: str) -> None:
+    def __init__(self, signed_in: SignedIn, pool: ViserPool, cookie: str, connects_within_s: float) -> None:
         self._signed_in, self._pool, self._cookie = signed_in, pool, cookie
+        self._connects_within_s = connects_within_s
         self._page: ViserPage | None = None
         self._expected: set[asyncio.Task[ViserPage]] = set()
 
@@ -161,7 +162,7 @@ class SceneEndpoints:
         async with self._pool.visit(session.organisation_id) as viewer:
             if make_ready is not None and view not in viewer.scenes:
                 await run_in_threadpool(make_ready, viewer.content)
-            for _ in range(int(_CONNECTS_WITHIN_S / _LOOKS_EVERY_S)):
+            for _ in range(int(self._connects_within_s / _LOOKS_EVERY_S)):
                 if view in viewer.scenes:
                     yield viewer.scenes[view]
                     return

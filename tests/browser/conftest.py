@@ -26,6 +26,7 @@ from app.cli.demo.world import World
 
 GALLERY = Path(__file__).parents[2] / "docs" / "pictures"
 KEY = "isd_browser-tests"
+USUAL = (1280, 720) if os.environ.get("ISODYN_GALLERY") else (960, 600)  # fewer pixels are drawn sooner
 
 
 @dataclass
@@ -121,7 +122,7 @@ def _wait_for(seen: Callable[[], bool], told: Callable[[], str], seconds: float 
 class Seat:
     """Somebody in front of the page: a browser context of their own."""
 
-    def __init__(self, town: Town, browser: Browser, width: int = 1280, height: int = 720) -> None:
+    def __init__(self, town: Town, browser: Browser, width: int = USUAL[0], height: int = USUAL[1]) -> None:
         self.town = town
         self.page: Page = browser.new_context(viewport={"width": width, "height": height}).new_page()
         self.faults: list[str] = []
@@ -172,7 +173,7 @@ class Seat:
         """A picture for the gallery of the documentation, when one is being made."""
         if os.environ.get("ISODYN_GALLERY"):
             picture = Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")
-            picture.quantize(192, dither=Image.Dither.NONE).save(GALLERY / f"{name}.png", optimize=True)
+            picture.save(GALLERY / f"{name}.jpg", quality=88, subsampling=0, optimize=True)
 
     def drop(self, place: str, name: str, data: bytes) -> None:
         """Drop a file on a place of the page."""

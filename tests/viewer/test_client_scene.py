@@ -1,9 +1,15 @@
 """What a page asks its scene for, over HTTP, and what viser's client is then sent."""
 
+import io
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from app.viewer.layers import layer_names
+from app.viewer.page import ViewerApp
+from app.viewer.source import PlacedPlan
 
 
 @pytest.fixture
@@ -190,13 +196,16 @@ def test_a_height_and_a_separation_are_drawn_as_asked(looking, source, grid_of):
     assert lifts[-1] == 15.0
 
 
-def test_a_view_belongs_to_its_session(running, looking):
-    for key in ("north-key", "south-key"):
-        other = running.cookie(key)
-        with running.client() as client:
-            client.timeout = 30.0
-            answer = client.post("/view/scene/view-0001/pick", headers={"Cookie": other}, json={"u": 0.5, "v": 0.5})
-        assert answer.status_code == 409  # a view of that name in another session is another view
+def test_a_view_belongs_to_its_session(serve, keys, source, open_page):
+    running = serve(ViewerApp(keys, source, connect_seconds=0.3))
+    cookie = running.cookie("north-key")
+    with running.websocket(cookie) as socket:
+        open_page(socket)
+        while running.ask(cookie, "show").status_code == 409:
+            pass
+        for key in ("north-key", "south-key"):
+            answer = running.ask(running.cookie(key), "pick", u=0.5, v=0.5)
+            assert answer.status_code == 409  # a view of that name in another session is another view
 
 
 def test_a_view_asks_with_its_own_origin_and_session(running):
@@ -212,3 +221,26 @@ def test_a_view_asks_with_its_own_origin_and_session(running):
         assert huge.status_code == 413
         broken = client.post("/view/scene/view-0001/show", content=b"[" * 100_000, headers={"Cookie": cookie})
         assert broken.status_code == 422
+
+
+def test_a_plan_lies_where_it_is_placed_and_can_be_hidden(looking, source):
+    picture = io.BytesIO()
+    Image.new("RGB", (40, 20), "white").save(picture, "PNG")
+    source.plans["floor-0"] = picture.getvalue()
+    tower = source.by_organisation["north"][0]
+    plan = PlacedPlan("a" * 64, 20.0, 10.0, 100.0, 40.0, np.pi / 2)
+    floors = (replace(tower.floors[0], plan=plan), *tower.floors[1:])
+    source.by_organisation["north"][0] = replace(tower, floors=floors)
+    looking.ask("show", floor_id="floor-0")
+    looking.canvas.read_until(lambda p: any(m["name"] == "/floor 0/plan" for m in p.of_type("ImageMessage")))
+    looking.canvas.read_for(0.3)
+    told = {m["type"]: m for m in looking.canvas.messages if m.get("name") == "/floor 0/plan"}
+    centre = [100.0 - 5.0 - 112.0, 40.0 + 10.0 - 47.0]  # a quarter turn about the corner, less the local origin
+    assert told["SetPositionMessage"]["position"][:2] == pytest.approx(centre)
+    assert told["SetOrientationMessage"]["wxyz"] == pytest.approx([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+    assert told["ImageMessage"]["props"]["render_width"] == 20.0
+    looking.ask("show", floor_id="floor-0", plan=False)
+    looking.canvas.read_for(0.5)
+    shown = [m["visible"] for m in looking.canvas.messages
+             if m["type"] == "SetSceneNodeVisibilityMessage" and m["name"] == "/floor 0/plan"]  # fmt: skip
+    assert shown[-1] is False

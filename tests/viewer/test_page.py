@@ -1,11 +1,14 @@
 """Signing in, and the page behind it, on a real server at a real port."""
 
+import io
 import socket
 import sys
 from pathlib import Path
 from subprocess import run
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from app.viewer.page import COOKIE, ViewerApp
 
@@ -120,6 +123,24 @@ def test_the_pickers_offer_ones_own_buildings_and_say_what_the_key_may(running):
     assert north["scopes"] == ["map:read"]
     assert north["buildings"][0]["floors"][0] == {"id": "floor-0", "name": "Ground", "ordinal": 0, "map_id": "map-0"}
     assert [b["name"] for b in south["buildings"]] == ["Secret shed"]
+
+
+def test_the_poster_is_the_layer_from_above(running, source):
+    cookie = {"Cookie": running.cookie("north-key")}
+    with running.client() as client:
+        assert client.get("/view/poster.png").status_code == 401
+        answer = client.get("/view/poster.png?floor=floor-0&layer=sd", headers=cookie)
+        assert answer.headers["content-type"] == "image/png"
+        picture = np.asarray(Image.open(io.BytesIO(answer.content)))
+        measured = source.grids["map-0"].measured[0]
+        np.testing.assert_array_equal(picture[::-1, :, 3] == 255, measured)  # north is up
+        other = client.get("/view/poster.png?floor=floor-0&layer=norm", headers=cookie)
+        assert other.content != answer.content
+        assert client.get("/view/poster.png?floor=floor-2", headers=cookie).status_code == 204  # no map
+        assert client.get("/view/poster.png?floor=floor-0&layer=nonsense", headers=cookie).status_code == 204
+        theirs = client.get("/view/poster.png?floor=floor-s", headers=cookie)
+        own = client.get("/view/poster.png", headers=cookie)
+        assert theirs.content == own.content  # a foreign link shows one's own first floor
 
 
 def test_signing_out_makes_the_cookie_worthless(running):

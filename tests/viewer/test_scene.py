@@ -1,9 +1,12 @@
 """What is drawn, as arrays: where it lies, what is left out, and how much there may be."""
 
+import io
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from app.viewer import scene
 from app.viewer.layers import ColourScale, layer_values
@@ -135,3 +138,56 @@ def test_the_camera_looks_at_the_map_from_the_south_or_from_above(grid_of):
     above, _ = scene.camera_pose([grid], origin, top=True)
     np.testing.assert_allclose(above[:2], 0.0, atol=0.01)
     assert np.isfinite(scene.camera_pose([], np.zeros(3))).all()
+
+
+def test_arrows_in_a_box_are_those_of_the_whole_floor_that_lie_in_it(grid_of):
+    grid, origin, box = grid_of(), np.zeros(3), (104.0, 41.0, 110.0, 45.0)
+    everywhere, inside = (
+        scene.field_arrows(grid, origin, 1.0).ends_m,
+        scene.field_arrows(grid, origin, 1.0, 0, box).ends_m,
+    )
+    x, y = everywhere[:, 0, 0], everywhere[:, 0, 1]
+    expected = everywhere[(x >= 104.0) & (x <= 110.0) & (y >= 41.0) & (y <= 45.0)]
+    assert 0 < len(expected) < len(everywhere)
+    assert {tuple(tail) for tail in inside[:, 0, :2].tolist()} == {tuple(tail) for tail in expected[:, 0, :2].tolist()}
+
+
+@given(st.floats(2.0, 400.0), st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
+def test_arrows_stand_closer_the_nearer_the_camera_and_fill_what_is_looked_at(distance_m, x, y):
+    target = np.array([x, y, 1.0])
+    spacing_m, box = scene.arrow_view(np.array([x, y, 1.0 + distance_m]), target, 0.25)
+    assert spacing_m == 0.25 * 2 ** round(np.log2(spacing_m / 0.25))  # steps of two: small moves change nothing
+    assert 0.25 <= spacing_m <= max(0.25, distance_m / 16.0)
+    half = 48.0 * spacing_m
+    assert box[0] <= x - half / 2 <= x + half / 2 <= box[2]
+    assert box[1] <= y - half / 2 <= y + half / 2 <= box[3]
+    assert (box[2] - box[0]) / spacing_m <= 97  # so that there are never many thousands
+
+
+def test_a_plan_is_opaque_and_its_transparent_places_are_paper():
+    picture = np.zeros((30, 3000, 4), np.uint8)
+    picture[:, :1500] = (10, 20, 30, 255)
+    data = io.BytesIO()
+    Image.fromarray(picture).save(data, "PNG")
+    plan = scene.plan_picture(data.getvalue())
+    assert plan.shape == (20, 2048, 3)
+    assert tuple(plan[10, 10]) == (10, 20, 30)
+    assert tuple(plan[10, -10]) == (255, 255, 255)
+
+
+def test_a_narrow_picture_is_looked_at_from_farther_away(grid_of):
+    grid = grid_of()
+    wide, narrow = (
+        scene.camera_pose([grid], np.zeros(3), top, 0.0, aspect)[0] for top, aspect in ((True, 1.6), (True, 0.5))
+    )
+    assert narrow[2] > 2.0 * wide[2]
+    wide, narrow = (scene.camera_pose([grid], np.zeros(3), False, 0.0, aspect)[0] for aspect in (1.6, 0.5))
+    assert narrow[2] > 1.5 * wide[2]
+
+
+def test_walks_take_the_colours_they_are_given(walk_of):
+    walk = walk_of("a")
+    colours = np.arange(200 * 3, dtype=np.uint8).reshape(200, 3)
+    _, drawn = scene.walk_segments([walk], np.zeros(3), [colours])
+    np.testing.assert_array_equal(drawn[:, 0], colours[:-1])
+    np.testing.assert_array_equal(drawn[:, 1], colours[1:])
