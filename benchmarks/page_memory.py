@@ -1,7 +1,7 @@
 """Whether memory stays flat while somebody switches layers, floors, views and positions for a long time.
 
 A page in Chromium before `isodyn serve` on a floor of 120 x 110 m. Every round shows each layer once, three marks, both
-views and a deep zoom; then memory is read: of the server, and of the page (its JavaScript heap after garbage collection;
+views and a deep zoom; then memory is read: of the server, and of the page (its JavaScript heap, garbage collected;
 textures and geometries that three.js holds cannot be asked, so the browser's whole memory is told, too). An hour of
 somebody who switches every three seconds is 1,200 switches. The last third of the rounds is set against the third after
 warming up: a ratio of 1 is flat.
