@@ -145,7 +145,7 @@ class Seat:
         """The canvas once it stays the same and shows something."""
         before, end = self.canvas(), time.monotonic() + 30.0
         while time.monotonic() < end:
-            self.page.wait_for_timeout(350)
+            self.page.wait_for_timeout(200)
             now = self.canvas()
             if (
                 self.page.locator("#busy").is_hidden()

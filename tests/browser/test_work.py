@@ -65,6 +65,7 @@ def test_a_bad_survey_is_refused_with_where_and_why(seat, town):
     expect(me.page.locator("#uploads").get_by_role("alert")).to_contain_text("ending")
 
 
+@pytest.mark.slow
 def test_a_map_is_built_on_request_with_its_progress_seen_by_everybody(seat, town):
     me, you = seat().open(f"?floor={town.floors[0]}"), seat().open()
     me.tab("Maps")

@@ -287,6 +287,7 @@ def test_map_and_panel_share_every_screen(page, width, height):
     page.set_viewport_size({"width": 900, "height": 700})
 
 
+@pytest.mark.slow
 def test_a_tap_reads_a_point_on_a_tablet(browser, file, grid):
     context = browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True)
     page = context.new_page()
@@ -301,6 +302,7 @@ def test_a_tap_reads_a_point_on_a_tablet(browser, file, grid):
     context.close()
 
 
+@pytest.mark.slow
 def test_a_scene_that_cannot_be_steered_still_shows_the_field_and_says_where_the_layers_are(browser, file):
     page = open_page(browser)
     page.add_init_script(
@@ -318,6 +320,7 @@ def test_a_scene_that_cannot_be_steered_still_shows_the_field_and_says_where_the
     page.close()
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_the_page_in_a_frame_of_its_own(browser, grid, tmp_path):
     exported = tmp_path / "tower.npz"
     exported.write_bytes(export_map(grid, "npz", "0" * 64))
