@@ -36,7 +36,7 @@ serve: install ## Run the API, the page and an embedded worker on port 8300
 	$(BIN)/isodyn serve $(ARGS)
 
 test: install-dev ## Install, and run all tests but the slow ones
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_PROCESSES) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: install-dev ## Run the slow tests
 	$(BIN)/python -m pytest -m slow $(ARGS)

@@ -54,6 +54,7 @@ def test_every_layer_is_another_picture_with_its_own_legend(seat, town):
             assert differs > 0.02, (name, other)
 
 
+@pytest.mark.slow
 def test_walks_arrows_and_outline_come_and_go(seat, town):
     me = seat().open(f"?floor={town.floors[0]}")
     for label in ("Field arrows", "Survey walks", "Floor outline"):
@@ -181,6 +182,7 @@ def test_a_key_that_may_only_read_cannot_change_anything(seat, town):
     expect(me.page.get_by_role("button", name="Locate")).to_be_disabled()
 
 
+@pytest.mark.slow
 def test_a_link_shows_the_same_to_somebody_else(seat, town):
     me = seat().open(f"?floor={town.floors[1]}&layer=sd")
     me.page.get_by_role("button", name="From above").click()
@@ -239,6 +241,7 @@ def test_it_fits_a_small_screen_and_a_tablet(seat, town, width, height):
         me.keep("tablet")
 
 
+@pytest.mark.slow
 def test_a_floor_plan_is_laid_under_the_map(seat, town, tmp_path):
     plan = tmp_path / "plan.png"
     picture = np.full((160, 240, 3), 255, np.uint8)
