@@ -69,14 +69,16 @@ function lines(picked) {
 
 const withSd = (mean, sd) => `${mean.toFixed(2)} ± ${sd.toFixed(2)} µT`.replaceAll("-", "−");
 
-/** A value that was clicked stays in the controls, with the surveys behind it. */
-export function showPicked(picked) {
+/** A value that was clicked stays in the controls, with the surveys behind it; what is typed meanwhile is left alone. */
+export function showPicked(picked, typed = false) {
   if (!picked) {
     put(byId("picked"), make("p", { className: "soft" }, "There is no map at that point."));
     return;
   }
-  byId("place-x").value = picked.point_m[0].toFixed(2);
-  byId("place-y").value = picked.point_m[1].toFixed(2);
+  if (!typed) {
+    byId("place-x").value = picked.point_m[0].toFixed(2);
+    byId("place-y").value = picked.point_m[1].toFixed(2);
+  }
   const facts = [["Place", `${picked.floor}, x ${picked.point_m[0].toFixed(2)} m, y ${picked.point_m[1].toFixed(2)} m`]];
   if (!picked.measured) facts.push(["Field", "not measured here: no survey came near enough"]);
   else {
@@ -114,7 +116,7 @@ export async function readPlace(state) {
     showPicked({
       floor: floor.name, point_m: [x, y, z], measured, components: answer.components, mean_ut: answer.mean_ut[0],
       sd_ut: answer.sd_ut[0], norm_ut: measured ? Math.hypot(...answer.mean_ut[0]) : null, layer: "norm", layer_value: null,
-    });
+    }, true);
   } catch (error) {
     put(byId("picked"), told(error));
   }
