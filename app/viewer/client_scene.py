@@ -15,8 +15,8 @@ from app.geometry import Array
 from app.viewer import scene as draw
 from app.viewer.asked import CameraPose, Marks, Shown, Target
 from app.viewer.chosen import Chosen, choose
-from app.viewer.floor_scene import DrawnFloor, ShownFloor, residual_scale, shared_scales
-from app.viewer.layers import LAYERS, ColourScale, about_layer
+from app.viewer.floor_scene import DrawnFloor, ShownFloor, layer_scale, norm_scale, residual_scale
+from app.viewer.layers import ColourScale, about_layer
 from app.viewer.legends import legend
 from app.viewer.marks import draw_marks, likelihood_legend
 from app.viewer.picture import Marked, Picked, Picture, SupportView, floors_in_words
@@ -43,11 +43,13 @@ class ClientScene:
         self._separation_m = 0.0
         self._scale: ColourScale | None = None
         self._norm_scale: ColourScale | None = None
+        self._residual_scale: ColourScale | None = None
         self._arrows_drawn: object = None
         self._arrow_count = 0
         self._suggested_separation_m = 0.0
         self.asked = Shown()
         self.has_shown = False
+        self.has_left = False
         self.marks = Marks()
         client.camera.on_update(self._on_camera)
 
@@ -63,12 +65,12 @@ class ClientScene:
                 if not same_floors:
                     self._set_stage(chosen)
                 self._separate(asked.separation_m)
-                told = self._fill(chosen, asked)
+                self._fill(chosen, asked)
                 self._apply_visibility(asked)
             self._chosen, self.asked, self.has_shown = chosen, asked, True
             self._move_camera(asked, first=moves_camera and not same_floors)
             self._draw_arrows(asked)
-            return told.model_copy(update={"arrows": self._arrow_count if asked.arrows else 0})
+            return self._in_words(chosen, asked)
 
     def mark(self, marks: Marks) -> Marked:
         """Draw a position, or a track, over the floors in place of the last; floors that are not shown are left out.
@@ -119,8 +121,9 @@ class ClientScene:
         return self._client is client
 
     def clear(self) -> None:
-        """Let go of maps and nodes; what was asked for stays known."""
+        """The client has left: let go of maps and nodes; what was asked for stays known."""
         with self._lock:
+            self.has_left = True
             self._chosen, self._floors, self._scale, self._norm_scale = None, [], None, None
 
     # -- drawing ----------------------------------------------------------------------------------------------------
@@ -141,35 +144,17 @@ class ClientScene:
         self._arrows_drawn = None
         self._suggested_separation_m = draw.suggested_separation_m(grids)
 
-    def _fill(self, chosen: Chosen, asked: Shown) -> Picture:
-        """The layer, the walks and the marks on the floors; and the picture in words."""
-        scale, self._norm_scale = shared_scales(chosen.floors, chosen.layer)
-        self._scale = scale
-        residuals = residual_scale(chosen.floors)
+    def _fill(self, chosen: Chosen, asked: Shown) -> None:
+        """The layer, the walks and the marks on the floors."""
+        self._scale = layer_scale(chosen.floors, chosen.layer)
+        self._norm_scale = self._scale if chosen.layer == "norm" else norm_scale(chosen.floors)
+        self._residual_scale = residual_scale(chosen.floors)
         for drawn, shown in zip(self._floors, chosen.floors, strict=True):
             self._draw_layer(drawn, shown)
             if asked.walks:
-                drawn.draw_walks(residuals)
-        self._draw_marks()
-        about = about_layer(chosen.layer)
-        grids = [f.grid for f in chosen.floors if f.grid is not None]
-        return Picture(
-            building_id=chosen.building_id,
-            floor_id=chosen.floor_id,
-            map_id=chosen.floors[0].map_id if chosen.floor_id and chosen.floors else None,
-            layer=chosen.layer,
-            height_m=chosen.height_m,
-            heights_m=list(chosen.heights_m),
-            layers=chosen.layers,
-            legend=legend(about.title, about.unit, scale) if grids else None,
-            walks_legend=legend("Survey walks: measured less map, over 1 m", "µT", residuals) if residuals else None,
-            floors=floors_in_words(chosen.floors),
-            ground_m=draw.ground_cell_m(grids),
-            separation_m=self._separation_m,
-            arrows=0,
-            walks=bool(asked.walks),
-            notes=list(chosen.notes),
-        )
+                drawn.draw_walks(self._residual_scale)
+        if self.marks:
+            self._draw_marks()
 
     def _draw_layer(self, drawn: DrawnFloor, shown: ShownFloor) -> None:
         if self._scale is not None:
@@ -240,6 +225,28 @@ class ClientScene:
 
     # -- words ------------------------------------------------------------------------------------------------------
 
+    def _in_words(self, chosen: Chosen, asked: Shown) -> Picture:
+        """What is drawn now."""
+        about, residuals = about_layer(chosen.layer), self._residual_scale
+        grids = [f.grid for f in chosen.floors if f.grid is not None]
+        return Picture(
+            building_id=chosen.building_id,
+            floor_id=chosen.floor_id,
+            map_id=chosen.floors[0].map_id if chosen.floor_id and chosen.floors else None,
+            layer=chosen.layer,
+            height_m=chosen.height_m,
+            heights_m=list(chosen.heights_m),
+            layers=chosen.layers,
+            legend=legend(about.title, about.unit, self._scale) if grids and self._scale else None,
+            walks_legend=legend("Survey walks: measured less map, over 1 m", "µT", residuals) if residuals else None,
+            floors=floors_in_words(chosen.floors),
+            ground_m=draw.ground_cell_m(grids),
+            separation_m=self._separation_m,
+            arrows=self._arrow_count if asked.arrows else 0,
+            walks=bool(asked.walks),
+            notes=list(chosen.notes),
+        )
+
     def _picked(self, floor: ShownFloor, point_m: Array, surveys: bool) -> Picked | None:
         """What is known at a place of a floor; None outside its map."""
         grid, values = floor.grid, floor.values
@@ -252,12 +259,13 @@ class ClientScene:
         at = grid.at(point_m[None, :])
         measured = bool(at.measured[0])
         layer = self._chosen.layer if self._chosen else "norm"
+        about = about_layer(layer)
         return Picked(
             floor_id=floor.floor.id, floor=floor.floor.name, map_id=floor.map_id, point_m=point_m.tolist(),
             measured=measured, components=list(grid.component_names),
             mean_ut=at.mean_uT[0].tolist() if measured else None, sd_ut=at.sd_uT[0].tolist() if measured else None,
             norm_ut=float(np.linalg.norm(at.mean_uT[0])) if measured else None,
-            layer=layer, layer_title=about_layer(layer).title, layer_unit=LAYERS[layer].unit,
+            layer=layer, layer_title=about.title, layer_unit=about.unit,
             layer_value=float(values[j, i]) if np.isfinite(values[j, i]) else None,
             surveys=_supports(floor, point_m) if surveys else None,
         )  # fmt: skip

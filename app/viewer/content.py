@@ -77,30 +77,12 @@ class _Walks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Layer:
-    values: Array
-
-    @property
-    def nbytes(self) -> int:
-        return self.values.nbytes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Residuals:
     each: tuple[Array, ...]
 
     @property
     def nbytes(self) -> int:
         return sum(residual.nbytes for residual in self.each)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Picture:
-    pixels: NDArray[np.uint8]
-
-    @property
-    def nbytes(self) -> int:
-        return self.pixels.nbytes
 
 
 class OrganisationContent:
@@ -133,7 +115,7 @@ class OrganisationContent:
             return layer_values(shown.grid, layer, height_index, stored)
 
         key = (self._organisation_id, "layer", map_id, layer, height_index, versus_id)
-        return self._recent.get(key, _Layer, lambda: _Layer(make())).values
+        return self._recent.get(key, np.ndarray, make)
 
     def walks(self, floor_id: str) -> list[Walk]:
         """Raises NotFound."""
@@ -152,7 +134,7 @@ class OrganisationContent:
         """The picture of a floor's plan (rows, columns, 3), as large as it is drawn. Raises NotFound."""
         key = (self._organisation_id, "plan", floor.id, floor.plan.sha256 if floor.plan else None)
 
-        def make() -> _Picture:
-            return _Picture(plan_picture(self._source.plan_image(self._organisation_id, floor.id)))
+        def make() -> NDArray[np.uint8]:
+            return plan_picture(self._source.plan_image(self._organisation_id, floor.id))
 
-        return self._recent.get(key, _Picture, make).pixels
+        return self._recent.get(key, np.ndarray, make)

@@ -20,7 +20,7 @@ from app.viewer.source import ViewedFloor, Walk
 if TYPE_CHECKING:
     from viser import FrameHandle, SceneApi, SceneNodeHandle
 
-__all__ = ["OUTLINE_RGB", "DrawnFloor", "ShownFloor", "residual_scale", "shared_scales"]
+__all__ = ["OUTLINE_RGB", "DrawnFloor", "ShownFloor", "layer_scale", "norm_scale", "residual_scale"]
 
 OUTLINE_RGB = (190, 200, 210)
 _UNKNOWN_RGB = (140, 140, 140)
@@ -51,10 +51,14 @@ class ShownFloor:
         return self.floor.elevation_m if self.grid is None else float(self.grid.heights_m[self.height_index])
 
 
-def shared_scales(shown: Sequence[ShownFloor], layer: str) -> tuple[ColourScale, ColourScale]:
-    """The colour scales of a layer and of |B| over all floors together, so that floors can be compared."""
-    norms = [layer_values(s.grid, "norm", s.height_index) for s in shown if s.grid is not None]
-    return colour_scale(layer, [s.values for s in shown if s.values is not None]), colour_scale("norm", norms)
+def layer_scale(shown: Sequence[ShownFloor], layer: str) -> ColourScale:
+    """The colour scale of a layer over all floors together, so that floors can be compared."""
+    return colour_scale(layer, [s.values for s in shown if s.values is not None])
+
+
+def norm_scale(shown: Sequence[ShownFloor]) -> ColourScale:
+    """The same of |B|, whichever layer is shown."""
+    return colour_scale("norm", [layer_values(s.grid, "norm", s.height_index) for s in shown if s.grid is not None])
 
 
 def residual_scale(shown: Sequence[ShownFloor]) -> ColourScale | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from app.viewer.asked import Shown
 from app.viewer.chosen import choose
-from app.viewer.floor_scene import shared_scales
+from app.viewer.floor_scene import layer_scale
 from app.viewer.scene import surface
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def poster_png(content: OrganisationContent, asked: Shown) -> bytes | None:
     from PIL import Image
 
     chosen = choose(content, asked.model_copy(update={"walks": False}))
-    scale, _ = shared_scales(chosen.floors, chosen.layer)
+    scale = layer_scale(chosen.floors, chosen.layer)
     for floor in chosen.floors:
         if floor.grid is not None and floor.values is not None:
             picture = surface(floor.grid, floor.values, scale, np.zeros(3), floor.height_index)

@@ -5,9 +5,11 @@ import hashlib
 from collections.abc import Mapping
 from html import escape
 
+from app.viewer.asked import ASKED_BY
+
 __all__ = ["LINK", "SIGN_IN_POLICY", "sign_in_html"]
 
-LINK = ("building", "floor", "map", "versus", "layer", "height", "camera")
+LINK = (*ASKED_BY, "camera")
 """What a deep link may ask for."""
 
 _STYLE = """

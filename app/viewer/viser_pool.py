@@ -34,7 +34,7 @@ __all__ = ["OrganisationViewer", "ViserPool"]
 
 _log = logging.getLogger(__name__)
 _RECENT_BYTES = 384 * 2**20
-_MOST_VIEWS = 1000
+_MOST_LEFT = 50  # of the views that nobody looks at any more, in case somebody comes back
 
 
 @dataclass(slots=True, eq=False)
@@ -68,8 +68,9 @@ class OrganisationViewer:
         before = self.scenes.get(view)
         self.scenes[view] = scene
         self.scenes.move_to_end(view)
-        while len(self.scenes) > _MOST_VIEWS:
-            self.scenes.popitem(last=False)
+        left = [name for name, each in self.scenes.items() if each.has_left]
+        for name in left[:-_MOST_LEFT]:
+            del self.scenes[name]
         if before is not None:
             scene.resume(before)
 

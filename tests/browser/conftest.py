@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,6 @@ class Town:
     world: World
     api: httpx.Client
     reader_key: str = ""
-    faults: list[str] = field(default_factory=list)
 
     def map_of(self, floor: int) -> str:
         return str(self.api.get(f"/v1/floors/{self.floors[floor]}").json()["active_map_id"])

@@ -1,10 +1,6 @@
 """The page in a real browser: somebody signs in and sees a field."""
 
-import io
-
-import numpy as np
 import pytest
-from matplotlib.image import imread
 from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.browser
@@ -15,20 +11,6 @@ def new_page(browser: Browser):
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(str(error)))
     return page
-
-
-def colourful_share(page) -> float:
-    """The share of the canvas that is neither background nor grey: how much field is to be seen."""
-    rgb = imread(io.BytesIO(page.locator("canvas").first.screenshot()))[..., :3]
-    return float((np.ptp(rgb, axis=-1) > 0.2).mean())
-
-
-def wait_for_field(page) -> None:
-    for _ in range(60):
-        if page.locator("canvas").count() and colourful_share(page) > 0.03:
-            return
-        page.wait_for_timeout(500)
-    pytest.fail(f"no field was drawn; the page reported {page.faults}")
 
 
 def test_somebody_signs_in_and_sees_a_field(running, browser):

@@ -72,10 +72,12 @@ def wait_for_field(page: Page) -> np.ndarray:
     pytest.fail(f"no field was drawn; the page reported {page.faults}")
 
 
-def wait_for_change(page: Page, before: np.ndarray) -> np.ndarray:
+def wait_for_change(page: Page, before: np.ndarray, least_px: int | None = None) -> np.ndarray:
+    """The picture once more than `least_px` of it are another colour (None: 0.4 % of it)."""
     for _ in range(40):
         now = picture(page)
-        if (np.abs(now - before).max(axis=-1) > 0.1).mean() > 0.004:
+        changed = np.abs(now - before).max(axis=-1) > 0.1
+        if changed.sum() > (0.004 * changed.size if least_px is None else least_px):
             return now
         page.wait_for_timeout(150)
     pytest.fail("the picture stayed as it was")
@@ -133,18 +135,9 @@ def test_arrows_walks_and_outline_come_and_go(page, extra):
     assert box.is_checked()
     before = picture(page)
     box.uncheck()
-    after = wait_for_change_of_lines(page, before)
+    after = wait_for_change(page, before, least_px=300)
     box.check()
-    wait_for_change_of_lines(page, after)
-
-
-def wait_for_change_of_lines(page: Page, before: np.ndarray) -> np.ndarray:
-    for _ in range(40):
-        now = picture(page)
-        if (np.abs(now - before).max(axis=-1) > 0.1).sum() > 300:
-            return now
-        page.wait_for_timeout(150)
-    pytest.fail("the picture stayed as it was")
+    wait_for_change(page, after, least_px=300)
 
 
 def test_a_height_brings_its_own_picture_and_numbers(page, grid):

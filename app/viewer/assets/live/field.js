@@ -26,7 +26,7 @@ export function offer(state) {
 
 /** The legends over the canvas, and the picture in words. */
 export function describe(picture, likelihood = null) {
-  const bars = [likelihood, picture.legend, byId("walks").checked ? picture.walks_legend : null].filter(Boolean).map(bar);
+  const bars = [likelihood, picture.legend, picture.walks_legend].filter(Boolean).map(bar);
   byId("legend").hidden = bars.length === 0;
   put(byId("legend"), ...bars);
   const unit = picture.legend?.unit ?? "";
