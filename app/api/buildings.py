@@ -9,17 +9,17 @@ from pydantic.config import JsonDict
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.api.auth import Identity, MapWriting, Reading
+from app.api.auth import MapWriting, Reading
 from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Name, RequestModel, unchanged
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Building
-from app.errors import NotFound
 
-__all__ = ["find_building", "router"]
+__all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["buildings"], responses=ERROR_RESPONSES)
 
@@ -59,14 +59,6 @@ def show_building(row: Building) -> BuildingView:
     return BuildingView.model_validate(row, from_attributes=True)
 
 
-def find_building(session: Session, identity: Identity, building_id: str) -> Building:
-    """The organisation's building. Raises NotFound."""
-    row = session.get(Building, building_id)
-    if row is None or row.organisation_id != identity.organisation_id:
-        raise NotFound(f"no building {building_id}")
-    return row
-
-
 @router.post("/buildings", status_code=201, response_model=BuildingView, summary="Make a building")
 def create_building(
     body: NewBuilding, request: Request, context: ContextDep, identity: MapWriting, key: IdempotencyKey = None
@@ -91,7 +83,7 @@ def list_buildings(context: ContextDep, identity: Reading, paging: PagingDep) ->
 @router.get("/buildings/{building_id}", response_model=BuildingView, summary="One building")
 def get_building(building_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
-        return pointer(request, show_building(find_building(session, identity, building_id)))
+        return pointer(request, show_building(find_own(session, identity, Building, building_id)))
 
 
 @router.patch("/buildings/{building_id}", summary="Change a building's name or anchor")
@@ -99,7 +91,7 @@ def patch_building(building_id: Id, body: BuildingPatch, context: ContextDep, id
     """What is not given stays. Outlines that came as longitude and latitude were put into building metres by the anchor
     of that time, and do not move with a new one: send them again."""
     with context.transaction() as session:
-        row = find_building(session, identity, building_id)
+        row = find_own(session, identity, Building, building_id)
         for name, value in body.model_dump(exclude_unset=True).items():
             setattr(row, name, value)
         session.flush()

@@ -8,20 +8,20 @@ from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.api.auth import Identity, MapWriting, Reading
-from app.api.buildings import find_building
+from app.api.auth import MapWriting, Reading
 from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Metres, Name, RequestModel, unchanged
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
-from app.db.tables import Floor, Map, Survey
-from app.errors import Conflict, NotFound
+from app.db.tables import Building, Floor, Map, Survey
+from app.errors import Conflict
 from app.jobs.queue import lock_floor
 from app.outline.polygons import in_building, outline_of, read_polygons
 
-__all__ = ["FloorView", "find_floor", "router", "show_floor"]
+__all__ = ["FloorView", "router", "show_floor"]
 
 router = APIRouter(prefix="/v1", tags=["floors"], responses=ERROR_RESPONSES)
 
@@ -112,14 +112,6 @@ def show_floor(row: Floor) -> FloorView:
     return FloorView.model_validate(row, from_attributes=True)
 
 
-def find_floor(session: Session, identity: Identity, floor_id: str) -> Floor:
-    """The organisation's floor. Raises NotFound."""
-    row = session.get(Floor, floor_id)
-    if row is None or row.organisation_id != identity.organisation_id:
-        raise NotFound(f"no floor {floor_id}")
-    return row
-
-
 def _read_outline(outline: dict[str, Any] | None) -> dict[str, Any] | None:
     """A body's outline as it is stored. Raises InvalidInput."""
     if outline is None:
@@ -133,7 +125,7 @@ def create_floor(
     key: IdempotencyKey = None,
 ) -> Response:  # fmt: skip
     def create(session: Session) -> tuple[int, BaseModel]:
-        building = find_building(session, identity, building_id)
+        building = find_own(session, identity, Building, building_id)
         row = Floor(organisation_id=identity.organisation_id, building_id=building.id,
                     **body.model_dump(exclude={"outline"}), outline=_read_outline(body.outline))  # fmt: skip
         session.add(row)
@@ -146,14 +138,14 @@ def create_floor(
 @router.get("/buildings/{building_id}/floors", summary="List a building's floors")
 def list_floors(building_id: Id, context: ContextDep, identity: Reading, paging: PagingDep) -> Page[FloorView]:
     with context.transaction() as session:
-        find_building(session, identity, building_id)
+        find_own(session, identity, Building, building_id)
         return list_page(session, select(Floor).where(Floor.building_id == building_id), Floor.id, paging, show_floor)
 
 
 @router.get("/floors/{floor_id}", response_model=FloorView, summary="One floor, and the map it answers with")
 def get_floor(floor_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
-        return pointer(request, show_floor(find_floor(session, identity, floor_id)))
+        return pointer(request, show_floor(find_own(session, identity, Floor, floor_id)))
 
 
 @router.patch("/floors/{floor_id}", summary="Change a floor")
@@ -166,7 +158,7 @@ def patch_floor(floor_id: Id, body: FloorPatch, context: ContextDep, identity: M
     """
     changes = body.model_dump(exclude_unset=True, exclude={"outline"})
     with context.transaction() as session:
-        row = find_floor(session, identity, floor_id)
+        row = find_own(session, identity, Floor, floor_id)
         if "outline" in body.model_fields_set:
             changes["outline"] = _read_outline(body.outline)
         if "elevation_m" in changes:

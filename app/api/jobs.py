@@ -10,16 +10,15 @@ from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 from sqlalchemy import select
-from sqlalchemy.orm import Session
 from sse_starlette import EventSourceResponse
 
-from app.api.auth import Identity, MapWriting, SurveyReading
+from app.api.auth import MapWriting, SurveyReading
 from app.api.context import ContextDep
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Id
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Job
-from app.errors import NotFound
 
 __all__ = ["JobView", "router", "show_job"]
 
@@ -54,13 +53,6 @@ def show_job(row: Job) -> JobView:
     )  # fmt: skip
 
 
-def _find_job(session: Session, identity: Identity, job_id: str) -> Job:
-    row = session.get(Job, job_id)
-    if row is None or row.organisation_id != identity.organisation_id:
-        raise NotFound(f"no job {job_id}")
-    return row
-
-
 @router.get("", summary="List jobs")
 def list_jobs(
     context: ContextDep,
@@ -81,14 +73,14 @@ def list_jobs(
 @router.get("/{job_id}", summary="One job's status and progress")
 def get_job(job_id: Id, context: ContextDep, identity: SurveyReading) -> JobView:
     with context.transaction() as session:
-        return show_job(_find_job(session, identity, job_id))
+        return show_job(find_own(session, identity, Job, job_id))
 
 
 @router.delete("/{job_id}", summary="Cancel a job")
 def cancel_job(job_id: Id, context: ContextDep, identity: MapWriting) -> JobView:
     """A waiting job is dismissed at once; a running one when it next reports progress; an ended one stays as it is."""
     with context.transaction() as session:
-        job = _find_job(session, identity, job_id)
+        job = find_own(session, identity, Job, job_id)
         if job.status not in FINAL:
             context.queue.request_cancel(session, job)
         return show_job(job)
@@ -105,7 +97,7 @@ async def job_events(job_id: Id, request: Request, context: ContextDep, identity
 
     def read() -> JobView:
         with context.transaction() as session:
-            return show_job(_find_job(session, identity, job_id))
+            return show_job(find_own(session, identity, Job, job_id))
 
     first = await run_in_threadpool(read)
 

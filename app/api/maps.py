@@ -17,11 +17,11 @@ from app import __version__
 from app.api.auth import Identity, MapWriting, Reading
 from app.api.caching import immutable, pointer
 from app.api.context import Context, ContextDep
-from app.api.floors import find_floor
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Metres, Point, RequestModel
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.api.windows import AskedWindowDep
 from app.db.tables import Floor, Map, Survey
@@ -151,13 +151,6 @@ def show_map(row: Map, active_map_id: str | None) -> MapView:
     )  # fmt: skip
 
 
-def _find_map(session: Session, identity: Identity, map_id: str) -> Map:
-    row = session.get(Map, map_id)
-    if row is None or row.organisation_id != identity.organisation_id:
-        raise NotFound(f"no map {map_id}")
-    return row
-
-
 def _check_together(body: NewMap) -> None:
     """Refuse what does not go together, one fault each."""
     faults = []
@@ -220,7 +213,7 @@ def create_map(
     _check_together(body)
 
     def create(session: Session) -> tuple[int, BaseModel]:
-        floor = find_floor(session, identity, floor_id)
+        floor = find_own(session, identity, Floor, floor_id)
         row = Map(
             organisation_id=floor.organisation_id,
             floor_id=floor.id,
@@ -241,7 +234,7 @@ def create_map(
 @router.get("/floors/{floor_id}/maps", summary="List a floor's maps")
 def list_maps(floor_id: Id, context: ContextDep, identity: Reading, paging: PagingDep) -> Page[MapView]:
     with context.transaction() as session:
-        active = find_floor(session, identity, floor_id).active_map_id
+        active = find_own(session, identity, Floor, floor_id).active_map_id
         mine = select(Map).where(Map.floor_id == floor_id)
         return list_page(session, mine, Map.id, paging, lambda row: show_map(row, active))
 
@@ -249,7 +242,7 @@ def list_maps(floor_id: Id, context: ContextDep, identity: Reading, paging: Pagi
 @router.get("/maps/{map_id}", response_model=MapView, summary="One map: its state, score and parameters")
 def get_map(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
-        row = _find_map(session, identity, map_id)
+        row = find_own(session, identity, Map, map_id)
         return pointer(request, show_map(row, session.get_one(Floor, row.floor_id).active_map_id))
 
 
@@ -257,7 +250,7 @@ def get_map(map_id: Id, request: Request, context: ContextDep, identity: Reading
 def activate_map(map_id: Id, context: ContextDep, identity: MapWriting) -> MapView:
     """Moves one pointer; works on any finished map of the floor, so it also rolls back."""
     with context.transaction() as session:
-        row = _find_map(session, identity, map_id)
+        row = find_own(session, identity, Map, map_id)
         if row.status != "ready":
             raise Conflict(f"map {map_id} is {row.status}; only a finished map can be activated")
         session.execute(
@@ -295,7 +288,7 @@ def read_field(map_id: Id, body: FieldQuery, context: ContextDep, identity: Read
 @router.get("/maps/{map_id}/quality", summary="Score, noise and every survey's consistency")
 def get_quality(map_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     with context.transaction() as session:
-        row = _find_map(session, identity, map_id)
+        row = find_own(session, identity, Map, map_id)
         sha256 = row.quality_sha256
     if sha256 is None:
         raise NotFound(f"map {map_id} is {row.status}; it has no quality report yet")
@@ -380,7 +373,7 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
 
     ready = ready_map(context, identity, map_id)
     with context.transaction() as session:
-        row = _find_map(session, identity, map_id)
+        row = find_own(session, identity, Map, map_id)
         floor = session.get_one(Floor, row.floor_id)
         surveys = session.scalars(select(Survey).where(Survey.id.in_(row.survey_ids)).order_by(Survey.id)).all()
 
@@ -414,7 +407,7 @@ class ReadyMap(NamedTuple):
 def ready_map(context: Context, identity: Identity, map_id: str) -> ReadyMap:
     """A finished map of the caller's. Raises NotFound, Conflict."""
     with context.transaction() as session:
-        row = _find_map(session, identity, map_id)
+        row = find_own(session, identity, Map, map_id)
         sha256, layers_sha256, status = row.grid_sha256, row.layers_sha256, row.status
     if sha256 is None:
         raise Conflict(f"map {map_id} is {status}; it has no field yet")

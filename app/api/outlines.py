@@ -7,13 +7,13 @@ from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
 from app.api.auth import MapWriting
-from app.api.buildings import find_building
 from app.api.context import ContextDep
-from app.api.floors import FloorView, find_floor, show_floor
+from app.api.floors import FloorView, show_floor
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
 from app.api.models import Finite, Id
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
-from app.db.tables import Building
+from app.db.tables import Building, Floor
 from app.errors import Conflict
 from app.geodesy import Anchor
 from app.outline.levels import read_levels, read_outline
@@ -79,7 +79,7 @@ def put_outline(
     `coordinates=wgs84` needs the building's anchor (409 without). `PATCH` with `{"outline": null}` removes it.
     """
     with context.transaction() as session:
-        floor = find_floor(session, identity, floor_id)
+        floor = find_own(session, identity, Floor, floor_id)
         place = _place(session.get_one(Building, floor.building_id), coordinates)
         floor.outline = read_outline(body, "/body", place, floor.ordinal)
         session.flush()
@@ -107,7 +107,7 @@ def post_import(
     """
 
     def create(session: Session) -> tuple[int, BaseModel]:
-        building = find_building(session, identity, building_id)
+        building = find_own(session, identity, Building, building_id)
         levels = read_levels(body, "/body", _place(building, coordinates))
         imported = import_floors(session, building, levels, storey_height_m)
         return 200, ImportView(

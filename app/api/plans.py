@@ -10,9 +10,11 @@ from app.api.auth import Identity, MapWriting, Reading
 from app.api.body import read_upload
 from app.api.caching import changing
 from app.api.context import Context, ContextDep
-from app.api.floors import FloorView, find_floor, show_floor
+from app.api.floors import FloorView, show_floor
 from app.api.models import Finite, Id, Metres
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
+from app.db.tables import Floor
 from app.errors import NotFound
 from app.services.receive_plan import MAX_PLAN_BYTES, Placement, Plan, place_plan
 
@@ -73,7 +75,7 @@ async def put_plan(
 def get_plan(floor_id: Id, request: Request, context: ContextDep, identity: Reading) -> Response:
     """The floor itself says where the picture lies."""
     with context.transaction() as session:
-        plan = find_floor(session, identity, floor_id).plan
+        plan = find_own(session, identity, Floor, floor_id).plan
     if plan is None:
         raise NotFound(f"floor {floor_id} has no plan; PUT a picture here")
     response = changing(request, plan["sha256"], lambda: context.blobs.get(plan["sha256"]), plan["media_type"])
@@ -91,12 +93,12 @@ def delete_plan(floor_id: Id, context: ContextDep, identity: MapWriting) -> Resp
 def _check_floor(context: Context, identity: Identity, floor_id: str) -> None:
     """Raise NotFound before the body is read."""
     with context.transaction() as session:
-        find_floor(session, identity, floor_id)
+        find_own(session, identity, Floor, floor_id)
 
 
 def _point_to(context: Context, identity: Identity, floor_id: str, plan: Plan | None) -> FloorView:
     with context.transaction() as session:
-        floor = find_floor(session, identity, floor_id)
+        floor = find_own(session, identity, Floor, floor_id)
         floor.plan = plan.as_row() if plan else None
         session.flush()
         return show_floor(floor)

@@ -13,10 +13,11 @@ from pydantic import BaseModel, Field
 from app.api.auth import Identity, Locating
 from app.api.body import read_upload
 from app.api.context import Context, ContextDep
-from app.api.floors import find_floor
 from app.api.models import Finite, Id
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.api.surveys import SURVEY_FILES, SurveyFormat
+from app.db.tables import Floor
 from app.errors import Conflict
 from app.services.locate_window import ActiveMap, active_maps
 from app.services.receive_survey import read_on_floor
@@ -89,7 +90,7 @@ async def replay(
 def _floor_and_maps(context: Context, identity: Identity, floor_id: str) -> tuple[float, list[ActiveMap]]:
     """The floor's elevation and its active map. Raises NotFound, Conflict."""
     with context.transaction() as session:
-        elevation_m = find_floor(session, identity, floor_id).elevation_m
+        elevation_m = find_own(session, identity, Floor, floor_id).elevation_m
         maps = active_maps(session.connection(), identity.organisation_id, floor_ids=[floor_id])
     if not maps:
         raise Conflict(f"floor {floor_id} has no map yet; upload surveys and wait for its job")

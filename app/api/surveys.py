@@ -13,11 +13,11 @@ from sqlalchemy.orm import Session
 from app.api.auth import Identity, SurveyReading, SurveyWriting
 from app.api.body import read_upload
 from app.api.context import Context, ContextDep
-from app.api.floors import find_floor
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Id, Name, RequestModel
+from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Floor, Job, Map, Survey
 from app.errors import NotFound
@@ -100,19 +100,12 @@ def show_survey(row: Survey) -> SurveyView:
     return SurveyView.model_validate(told | {name: getattr(row, name) for name in names})
 
 
-def _find_survey(session: Session, identity: Identity, survey_id: str) -> Survey:
-    row = session.get(Survey, survey_id)
-    if row is None or row.organisation_id != identity.organisation_id:
-        raise NotFound(f"no survey {survey_id}")
-    return row
-
-
 def _lock_survey(session: Session, identity: Identity, survey_id: str) -> Survey:
     """The survey, read again once its floor is locked: whoever came first has changed or deleted it."""
-    survey = _find_survey(session, identity, survey_id)
+    survey = find_own(session, identity, Survey, survey_id)
     lock_floor(session, survey.floor_id)
     session.expunge(survey)
-    return _find_survey(session, identity, survey_id)
+    return find_own(session, identity, Survey, survey_id)
 
 
 @router.post(
@@ -168,7 +161,7 @@ async def upload_survey(
         )  # fmt: skip
 
         def create(transaction: Session) -> tuple[int, BaseModel]:
-            floor = find_floor(transaction, identity, floor_id)
+            floor = find_own(transaction, identity, Floor, floor_id)
             survey, job, new = record_survey(transaction, context.queue, floor, parsed, replaces)
             view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
             return 202 if new else 200, view
@@ -181,7 +174,7 @@ async def upload_survey(
 def _elevation_m(context: Context, identity: Identity, floor_id: str, replaces: str | None) -> float:
     """Of the floor; raises NotFound and InvalidInput before anything is stored."""
     with context.transaction() as session:
-        floor = find_floor(session, identity, floor_id)
+        floor = find_own(session, identity, Floor, floor_id)
         if replaces is not None and not was_replaced(session, floor, replaces):
             find_replaced(session, floor, replaces)
         return floor.elevation_m
@@ -190,20 +183,20 @@ def _elevation_m(context: Context, identity: Identity, floor_id: str, replaces: 
 @router.get("/floors/{floor_id}/surveys", summary="List a floor's surveys")
 def list_surveys(floor_id: Id, context: ContextDep, identity: SurveyReading, paging: PagingDep) -> Page[SurveyView]:
     with context.transaction() as session:
-        find_floor(session, identity, floor_id)
+        find_own(session, identity, Floor, floor_id)
         return list_page(session, select(Survey).where(Survey.floor_id == floor_id), Survey.id, paging, show_survey)
 
 
 @router.get("/surveys/{survey_id}", summary="One survey")
 def get_survey(survey_id: Id, context: ContextDep, identity: SurveyReading) -> SurveyView:
     with context.transaction() as session:
-        return show_survey(_find_survey(session, identity, survey_id))
+        return show_survey(find_own(session, identity, Survey, survey_id))
 
 
 @router.get("/surveys/{survey_id}/report", summary="What was read, and what the reader assumed")
 def get_report(survey_id: Id, context: ContextDep, identity: SurveyReading) -> dict[str, Any]:
     with context.transaction() as session:
-        return _find_survey(session, identity, survey_id).report
+        return find_own(session, identity, Survey, survey_id).report
 
 
 class ConsistencyView(BaseModel):
@@ -238,7 +231,7 @@ def get_consistency(
     ] = None,
 ) -> ConsistencyView:
     with context.transaction() as session:
-        survey = _find_survey(session, identity, survey_id)
+        survey = find_own(session, identity, Survey, survey_id)
         wanted = map_id or session.scalars(select(Floor.active_map_id).where(Floor.id == survey.floor_id)).one()
         map_row = session.get(Map, wanted) if wanted else None
         if map_row is None or map_row.floor_id != survey.floor_id or map_row.quality_sha256 is None:
@@ -258,7 +251,7 @@ def get_samples(
     limit: Annotated[int, Query(ge=1, le=100_000, description="evenly thinned to at most this many")] = 10_000,
 ) -> SurveySamples:
     with context.transaction() as session:
-        sha256 = _find_survey(session, identity, survey_id).samples_sha256
+        sha256 = find_own(session, identity, Survey, survey_id).samples_sha256
     samples = samples_from_bytes(context.blobs.get(sha256))
     kept = slice(None, None, -(-len(samples) // limit))
     field_columns = ["b_ut"] if samples.frame == "norm" else ["bx_ut", "by_ut", "bz_ut"]

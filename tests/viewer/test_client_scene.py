@@ -1,6 +1,7 @@
 """What a page asks its scene for, over HTTP, and what viser's client is then sent."""
 
 import io
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -244,3 +245,21 @@ def test_a_plan_lies_where_it_is_placed_and_can_be_hidden(looking, source):
     shown = [m["visible"] for m in looking.canvas.messages
              if m["type"] == "SetSceneNodeVisibilityMessage" and m["name"] == "/floor 0/plan"]  # fmt: skip
     assert shown[-1] is False
+
+
+def test_views_long_left_are_forgotten_and_those_looked_at_are_not(running, open_page, monkeypatch):
+    monkeypatch.setattr("app.viewer.viser_pool._MOST_LEFT", 2)
+    cookie = running.cookie("north-key")
+    with running.websocket(cookie, "/view/scene/staying-1") as kept:
+        open_page(kept)
+        assert running.ask(cookie, "show", "staying-1").status_code == 200
+        (viewer,) = running.viewer.pool.running().values()
+        for number in range(5):
+            view = f"leaving-{number}"
+            with running.websocket(cookie, f"/view/scene/{view}") as socket:
+                open_page(socket)
+                assert running.ask(cookie, "show", view, floor_id="floor-0").status_code == 200
+            while not next(each for name, each in viewer.scenes.items() if name.endswith(view)).has_left:
+                time.sleep(0.01)
+        assert len(viewer.scenes) <= 4  # the one looked at, two that left before the last came, and the last
+        assert running.ask(cookie, "show", "staying-1", layer="sd").status_code == 200
