@@ -18,7 +18,9 @@ export const put = (place, ...children) => place.replaceChildren(...children.fil
 
 /** Something to be read: a sentence and, of a refusal, where and why. */
 export function told(error, kind = "bad") {
-  const faults = (error.faults ?? []).map((fault) => make("li", {}, `${fault.location}: ${fault.reason}`));
+  const said = (fault) => error.message.includes(fault.location) && error.message.includes(fault.reason);
+  const faults = (error.faults ?? []).filter((fault) => !said(fault))
+    .map((fault) => make("li", {}, `${fault.location}: ${fault.reason}`));
   return make("div", { className: `told ${kind}`, role: kind === "bad" ? "alert" : "status" },
     typeof error === "string" ? error : error.message, faults.length ? make("ul", {}, ...faults) : null);
 }
