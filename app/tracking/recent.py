@@ -1,0 +1,64 @@
+"""The last metres of a track: readings far enough apart to tell something new, as a window for the global search."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.geometry import Array
+from app.positioning.window import Window, WindowFrame
+
+__all__ = ["Reading", "Recent"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """Samples taken within one `update_m`, averaged.
+
+    B_uT             (3,) or (1,) their mean, in the track's frame
+    samples          how many they were
+    displacement_m   (3,) and yaw_rad: of the device at the last of them
+    device_to_frame  (3, 3) of the last of them, or None
+    """
+
+    number: int
+    t_s: float
+    B_uT: Array
+    samples: int
+    displacement_m: Array
+    yaw_rad: float
+    device_to_frame: Array | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recent:
+    """Readings in order, and the distance walked up to each."""
+
+    readings: tuple[Reading, ...] = ()
+    path_m: tuple[float, ...] = ()
+
+    @property
+    def length_m(self) -> float:
+        return self.path_m[-1] - self.path_m[0] if self.path_m else 0.0
+
+    def with_reading(self, reading: Reading, path_m: float, keep_m: float) -> "Recent":
+        """And one more; what is farther behind than `keep_m` is forgotten."""
+        first = int(np.searchsorted(self.path_m, path_m - keep_m)) if self.path_m else 0
+        return Recent((*self.readings[first:], reading), (*self.path_m[first:], path_m))
+
+    def window(
+        self, frame: WindowFrame, noise_uT: float, heading_rad: float | None, heading_sd_rad: float | None
+    ) -> Window:
+        """The readings as a window whose frame is the track's."""
+        displacement = np.array([each.displacement_m for each in self.readings])
+        tilt = [each.device_to_frame for each in self.readings]
+        samples = float(np.mean([each.samples for each in self.readings]))
+        return Window(
+            frame=frame,
+            B_uT=np.array([each.B_uT for each in self.readings]),
+            displacement_m=displacement - displacement[0],
+            noise_uT=noise_uT / np.sqrt(samples),
+            heading_rad=heading_rad,
+            heading_sd_rad=heading_sd_rad,
+            yaw_rad=np.array([each.yaw_rad for each in self.readings]),
+            device_to_frame=None if any(each is None for each in tilt) else np.array(tilt),
+        )

@@ -1,0 +1,179 @@
+"""Particles where the global search finds the last metres of a track, and how sure that is.
+
+Poses are drawn from the search's candidates, spread over what lies between the poses of its lattice, and then weighed
+exactly: each is carried along its own course through the whole window, with the filter every particle has, so that they
+start out knowing the sensor's offset.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.geometry import Array
+from app.positioning.fix import LocateOptions, Prior
+from app.positioning.floors import SearchableFloor
+from app.positioning.matching import Matched, match
+from app.positioning.off_map import OFF_MAP_PRIOR, off_map
+from app.positioning.window import Window, WindowFrame
+from app.tracking.ground import Barriers, Ground
+from app.tracking.moves import Moves
+from app.tracking.options import StartPrior, TrackOptions
+from app.tracking.particles import (
+    COURSE,
+    DRAWS,
+    DRIFT,
+    HEADING,
+    MEASURED,
+    SCALE,
+    X,
+    Y,
+    Z,
+    Particles,
+    advance,
+    log_evidence,
+    new_particles,
+)
+from app.tracking.places import Places
+
+__all__ = ["Found", "find", "particles_around"]
+
+_STILL = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Weighted particles at the end of a window, their positions (r, n, 2) at each of its readings, and the log of how
+
+    much better the map explains the window than no map does."""
+
+    particles: Particles
+    history_m: Array
+    log_ratio: float
+
+
+def find(
+    moves: Moves, window: Window, floors: Sequence[SearchableFloor], places: Places, barriers: Barriers,
+    options: TrackOptions, prior: Prior | None, count: int, rng: np.random.Generator,
+) -> Found:  # fmt: skip
+    """Search all floors for a window whose readings are `moves`. Raises InvalidInput where nothing is walkable."""
+    asked = LocateOptions(
+        bias_sd_uT=options.bias_sd_uT, step_scale_sd=options.step_scale_sd,
+        heading_drift_sd_rad_per_m=options.heading_drift_sd_rad_per_m, walkable=_walkable(options.ground),
+    )  # fmt: skip
+    matched = match(window, floors, places.components, "raw", prior, asked)
+    drawn, proposed = _draw(matched, places, window.frame, count, rng)
+    offset = moves.offset_variance_uT2
+    particles, history = _carried(drawn, moves, places, barriers, offset)
+    peak = float(matched.score[0])
+    mass, nowhere = float(np.exp(matched.score - peak).sum()), off_map(matched, peak)
+    weighed = replace(particles, log_weight=particles.log_weight - proposed)
+    known = weighed.rows[:, MEASURED] >= 0.5
+    if known.any():
+        share = np.exp(log_evidence(_only(weighed, known)) - log_evidence(weighed))
+        weighed, history = _only(weighed, known), history[:, known]
+    else:
+        share = 1e-9
+    even = weighed.log_weight - log_evidence(weighed)
+    odds = OFF_MAP_PRIOR / (1.0 - OFF_MAP_PRIOR)
+    log_ratio = float(np.log(max(mass * share, 1e-300)) - np.log(max(nowhere.mass / odds, 1e-300)))
+    return Found(replace(weighed, log_weight=even), history, log_ratio)
+
+
+def particles_around(
+    prior: StartPrior, places: Places, heading_rad: float | None, heading_sd_rad: float | None,
+    offset_variance_uT2: float, options: TrackOptions, frame: WindowFrame, rng: np.random.Generator,
+) -> Particles:  # fmt: skip
+    """Particles about a place that was told, on the floors whose heights agree with it."""
+    n = options.particles
+    position = np.asarray(prior.position_m) + prior.sd_m * rng.normal(size=(n, 3))
+    gap = np.abs(position[:, 2:] - places.heights_m)
+    floor = np.argmin(gap, axis=1)
+    position[:, 2] = places.heights_m[floor]
+    if frame == "building":
+        heading = np.zeros(n)
+    elif heading_rad is None:
+        heading = rng.uniform(-np.pi, np.pi, n)
+    else:
+        heading = heading_rad + (heading_sd_rad or 0.0) * rng.normal(size=n)
+    particles = new_particles(position, floor, heading, offset_variance_uT2)
+    particles.rows[:, SCALE] += options.step_scale_sd * rng.normal(size=n)
+    particles.rows[:, COURSE] = options.course_sd_rad * rng.normal(size=n)
+    if frame != "building":
+        particles.rows[:, DRIFT] = options.heading_drift_sd_rad_per_m * rng.normal(size=n)
+    return replace(particles, log_weight=np.full(n, -np.log(n)))
+
+
+def _draw(
+    matched: Matched, places: Places, frame: WindowFrame, count: int, rng: np.random.Generator
+) -> tuple[Particles, Array]:
+    """Particles at the end of the window, and the log of what each was drawn with, up to a constant."""
+    w = np.exp(matched.score - matched.score[0])
+    edges = np.cumsum(w)
+    chosen = np.searchsorted(edges, (rng.uniform() + np.arange(count)) / count * edges[-1], side="right")
+    chosen = np.minimum(chosen, len(w) - 1)
+    found, courses = matched.candidates, matched.courses
+    plane, course = found.plane[chosen], found.course[chosen]
+    cell = np.array([each.resolution_m for each in matched.planes])[plane]
+    floor = matched.plane_floor[plane]
+    spread = rng.uniform(-0.5, 0.5, size=(count, 5))
+    position = np.column_stack([
+        matched.position_m[chosen] + cell[:, None] * spread[:, :2],
+        np.array([each.height_m for each in matched.planes])[plane],
+    ])  # fmt: skip
+    half_m = 0.5 * float(matched.window.path_m[-1] - matched.window.path_m[0])
+    drift, heading = courses.drift_rad_per_m[course], courses.heading_rad[course]
+    if frame != "building":
+        drift = drift + courses.steps.drift_rad_per_m * spread[:, 4] * (matched.options.heading_drift_sd_rad_per_m > 0)
+        heading = heading + courses.steps.heading_rad * spread[:, 2]
+    particles = new_particles(position, floor, heading + drift * half_m, 0.0)
+    particles.rows[:, DRIFT] = drift
+    scale = courses.scale[course]
+    if matched.options.step_scale_sd > 0.0:
+        scale = scale + courses.steps.scale * spread[:, 3]
+    particles.rows[:, SCALE] = scale
+    return particles, matched.score[chosen] - courses.log_prior[course]
+
+
+def _carried(
+    ends: Particles, moves: Moves, places: Places, barriers: Barriers, offset_variance_uT2: float
+) -> tuple[Particles, Array]:
+    """Particles carried through the window so that they end where they were drawn: weighed, and where they were."""
+    n, length_m = len(ends), float(sum(each.distance_m for each in moves.advances))
+    rows = ends.rows.copy()
+    rows[:, HEADING] -= rows[:, DRIFT] * length_m
+    begun = new_particles(rows[:, :3], ends.floor, rows[:, HEADING], offset_variance_uT2)
+    begun.rows[:, [SCALE, DRIFT]] = rows[:, [SCALE, DRIFT]]
+    still = np.zeros((n, DRAWS), dtype=np.float32)
+    blind = begun
+    for each in moves.advances:
+        blind = advance(blind, replace(each, features_uT=None, walk=_STILL), places, barriers, still)
+    begun.rows[:, [X, Y]] -= blind.rows[:, [X, Y]] - ends.rows[:, [X, Y]]
+    begun.rows[:, Z] = ends.rows[:, Z]
+    history = np.empty((len(moves.advances), n, 2))
+    particles = begun
+    for k, each in enumerate(moves.advances):
+        particles = advance(particles, replace(each, walk=_STILL, risen_m=0.0), places, barriers, still)
+        history[k] = particles.position_m
+    return particles, history
+
+
+def _only(particles: Particles, kept: NDArray[np.bool_]) -> Particles:
+    return Particles(particles.rows[kept], particles.floor[kept], particles.log_weight[kept])
+
+
+def _walkable(ground: Ground | None):  # type: ignore[no-untyped-def]
+    if ground is None or not ground.walkable:
+        return None
+
+    def inside(floor_id: str, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
+        test = ground.walkable.get(floor_id)
+        x, y = np.meshgrid(x_m, y_m)
+        if test is None:
+            return np.ones(x.shape, dtype=np.bool_)
+        return np.asarray(test(np.column_stack([x.ravel(), y.ravel()]))).reshape(x.shape)
+
+    return inside
+
+
