@@ -40,7 +40,11 @@ class Carried:
 
 
 def carry(
-    building: SyntheticBuilding, walk: SyntheticWalk, sensor: Magnetometer, reckoned: DeadReckoned, rng: np.random.Generator
+    building: SyntheticBuilding,
+    walk: SyntheticWalk,
+    sensor: Magnetometer,
+    reckoned: DeadReckoned,
+    rng: np.random.Generator,
 ) -> Carried:
     """A device that does not know where it starts, nor which way it faces: level, held forward."""
     yaw = np.unwrap(walk.heading_rad)
@@ -57,7 +61,9 @@ def carry(
     told = scale * np.stack([c * way[:, 0] - s * way[:, 1], s * way[:, 0] + c * way[:, 1]], axis=1)
     told += reckoned.noise_m * np.sqrt(length)[:, None] * rng.normal(size=told.shape)
     moved = np.column_stack([np.cumsum(told, axis=0), np.zeros(len(told))])
-    return Carried(_steps(building, walk, sensor, believed, moved, rng), walk.p_building_m, np.full(len(walk), walk.floor))
+    return Carried(
+        _steps(building, walk, sensor, believed, moved, rng), walk.p_building_m, np.full(len(walk), walk.floor)
+    )
 
 
 def _steps(

@@ -1,15 +1,15 @@
 """What weighted particles say: a place with its uncertainty, the other places it may be, and how sure that is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.geometry import Array, wrap_angle_rad
-from app.tracking.particles import HEADING, MEASURED, SCALE, Z, Particles, effective_sample_size
+from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Z, Particles, effective_sample_size
 
-__all__ = ["Estimate", "Spot", "State", "describe", "kld_sample_size", "occupied_bins"]
+__all__ = ["Estimate", "Spot", "State", "carried_on", "describe", "kld_sample_size", "occupied_bins"]
 
 State = Literal["searching", "converged", "lost"]
 
@@ -42,7 +42,7 @@ class Estimate:
     spots                       strongest first
     concentration               share of the belief in the strongest spot
     measured                    how much of the last metres is mapped
-    step_scale, offset_uT       of displacements, and of the sensor (scaled features)
+    step_scale, course_rad      of displacements: their true length over what was told, and their turn
     """
 
     floor: int
@@ -57,6 +57,7 @@ class Estimate:
     concentration: float
     measured: float
     step_scale: float
+    course_rad: float
     particles: int
     effective_sample_size: float
 
@@ -91,9 +92,27 @@ def describe(particles: Particles, weight: Array, floors: int, map_variance_m2: 
         concentration=best.probability,
         measured=float(w @ rows[:, MEASURED]),
         step_scale=float(w @ rows[:, SCALE]),
+        course_rad=float(w @ rows[:, COURSE]),
         particles=len(particles),
         effective_sample_size=effective_sample_size(weight),
     )
+
+
+def carried_on(estimate: Estimate, moved_m: Array) -> Estimate:
+    """The estimate after the device went on by `moved_m` (3,) in the track's frame, as it reckons itself."""
+
+    def on(position_m: tuple[float, float, float], heading_rad: float) -> tuple[float, float, float]:
+        angle = heading_rad + estimate.course_rad
+        c, s = estimate.step_scale * np.cos(angle), estimate.step_scale * np.sin(angle)
+        x, y, z = position_m
+        return (
+            float(x + c * moved_m[0] - s * moved_m[1]),
+            float(y + s * moved_m[0] + c * moved_m[1]),
+            float(z + moved_m[2]),
+        )
+
+    spots = tuple(replace(spot, position_m=on(spot.position_m, spot.heading_rad)) for spot in estimate.spots)
+    return replace(estimate, position_m=on(estimate.position_m, estimate.heading_rad), spots=spots)
 
 
 def _spots(particles: Particles, weight: Array) -> list[Spot]:

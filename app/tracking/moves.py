@@ -66,9 +66,7 @@ def move_between(
     )  # fmt: skip
 
 
-def window_moves(
-    readings: Sequence[Reading], frame: WindowFrame, places: Places, options: TrackOptions
-) -> Moves:
+def window_moves(readings: Sequence[Reading], frame: WindowFrame, places: Places, options: TrackOptions) -> Moves:
     """The moves of a window's readings."""
     befores = (None, *readings[:-1])
     return Moves(

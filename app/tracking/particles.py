@@ -75,7 +75,9 @@ class Advance:
     turns: bool
 
 
-def new_particles(position_m: Array, floor: NDArray[np.int64], heading_rad: Array, offset_variance_uT2: float) -> Particles:
+def new_particles(
+    position_m: Array, floor: NDArray[np.int64], heading_rad: Array, offset_variance_uT2: float
+) -> Particles:
     """Of one weight, at positions (n, 3)."""
     rows = np.zeros((len(position_m), COLUMNS))
     rows[:, :3], rows[:, HEADING], rows[:, SCALE], rows[:, MEASURED] = position_m, heading_rad, 1.0, 1.0
@@ -83,7 +85,9 @@ def new_particles(position_m: Array, floor: NDArray[np.int64], heading_rad: Arra
     return Particles(rows, np.asarray(floor, dtype=np.int64), np.zeros(len(rows)))
 
 
-def advance(particles: Particles, move: Advance, places: Places, barriers: Barriers, noise: NDArray[np.float32]) -> Particles:
+def advance(
+    particles: Particles, move: Advance, places: Places, barriers: Barriers, noise: NDArray[np.float32]
+) -> Particles:
     """Move particles and weigh them by the reading; noise (n, DRAWS) standard normal numbers."""
     rows, log_weight = particles.rows.copy(), particles.log_weight.copy()
     features = np.zeros(0) if move.features_uT is None else move.features_uT

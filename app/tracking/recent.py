@@ -12,12 +12,13 @@ __all__ = ["Reading", "Recent"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """Samples taken within one `update_m`, averaged.
+    """Samples taken within a cell of the map, averaged: nearer ones tell nothing new.
 
+    number, t_s      of the last of them, and their mean time
     B_uT             (3,) or (1,) their mean, in the track's frame
     samples          how many they were
-    displacement_m   (3,) and yaw_rad: of the device at the last of them
-    device_to_frame  (3, 3) of the last of them, or None
+    displacement_m   (3,) where they were taken, on average
+    yaw_rad, device_to_frame   of the device at the last of them
     """
 
     number: int

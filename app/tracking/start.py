@@ -175,5 +175,3 @@ def _walkable(ground: Ground | None):  # type: ignore[no-untyped-def]
         return np.asarray(test(np.column_stack([x.ravel(), y.ravel()]))).reshape(x.shape)
 
     return inside
-
-

@@ -31,5 +31,3 @@ class Step:
     device_to_frame: Array | None = None
     heading_rad: float | None = None
     heading_sd_rad: float | None = None
-
-

@@ -20,7 +20,7 @@ from app.geometry import Array
 from app.positioning.features import common_components
 from app.positioning.floors import SearchableFloor, reduce_floor, shared_noise_sd_uT
 from app.positioning.window import WindowFrame
-from app.tracking.estimate import Estimate, State, describe, kld_sample_size, occupied_bins
+from app.tracking.estimate import Estimate, State, carried_on, describe, kld_sample_size, occupied_bins
 from app.tracking.ground import Barriers, barriers_of
 from app.tracking.moves import Moves, move_between, offset_variance_uT2, window_moves
 from app.tracking.no_map import NoMap, predict_without_map, without_map
@@ -53,12 +53,18 @@ class Tracker:
     seed: int
     prior: StartPrior | None = None
 
+    @property
+    def spacing_m(self) -> float:
+        """Of readings: nearer ones meet the same cell of the map."""
+        return max(self.options.update_m, float(self.places.resolution_m.min()))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackState:
     """Everything that changes.
 
-    step            the last one followed; `gathered` samples since the last reading: how many, and their sum (c,)
+    step            the last one followed; `samples` since the last reading: how many, and in `gathered` the sums of their
+                    place, time and field
     course_rad      (2,) direction of the path at its start and now, in the track's frame; NaN: not known yet
     particles       None while they are searched for
     log_odds        how much better the particles predict the readings than no map does, kept to MOST_ODDS
@@ -67,8 +73,8 @@ class TrackState:
     """
 
     step: Step | None = None
-    gathered: int = 0
-    sum_uT: Array | None = None
+    samples: int = 0
+    gathered: Array | None = None
     path_m: float = 0.0
     course_rad: tuple[float, float] = (np.nan, np.nan)
     course_from_m: Array | None = None
@@ -97,7 +103,11 @@ class Followed:
 
 
 def make_tracker(
-    floors: Sequence[SearchableFloor], frame: WindowFrame, options: TrackOptions, seed: int, prior: StartPrior | None = None
+    floors: Sequence[SearchableFloor],
+    frame: WindowFrame,
+    options: TrackOptions,
+    seed: int,
+    prior: StartPrior | None = None,
 ) -> Tracker:
     """Raises InvalidInput without floors, IncompatibleFrames where a map cannot answer the frame."""
     if not floors:
@@ -143,7 +153,11 @@ def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
 
 
 def _followed(state: TrackState, settled: tuple[Smoothed, ...]) -> Followed:
-    return Followed(state, state.estimate, _sure(state), settled)
+    """The belief, carried on to where the device is by now from where it was last compared with the map."""
+    estimate, step = state.estimate, state.step
+    if estimate is not None and step is not None and step.displacement_m is not None:
+        estimate = carried_on(estimate, step.displacement_m - state.recent.readings[-1].displacement_m)
+    return Followed(state, estimate, _sure(state), settled)
 
 
 def _sure(state: TrackState) -> float:
@@ -179,19 +193,21 @@ def _reading(tracker: Tracker, state: TrackState, step: Step) -> tuple[Reading |
     """The samples since the last reading as a new one, once the device is far enough from it."""
     if step.B_uT is None:
         return None, state
-    total = np.asarray(step.B_uT, dtype=np.float64) + (0.0 if state.sum_uT is None else state.sum_uT)
-    count = state.gathered + 1
+    place = np.zeros(3) if step.displacement_m is None else step.displacement_m
+    told = np.concatenate([place, [step.t_s], step.B_uT])
+    total = told if state.gathered is None else state.gathered + told
+    count = state.samples + 1
     first, now = state.course_rad
     yaw_rad = step.yaw_rad if step.yaw_rad is not None else (0.0 if np.isnan(now) else now - first)
-    place = np.zeros(3) if step.displacement_m is None else np.asarray(step.displacement_m, dtype=np.float64)
     if state.recent.readings:
         last = state.recent.readings[-1]
-        near = np.linalg.norm(place - last.displacement_m) < max(tracker.options.update_m, float(tracker.places.resolution_m.min()))
+        near = state.path_m - state.recent.path_m[-1] < tracker.spacing_m
         turned = abs(np.angle(np.exp(1j * (yaw_rad - last.yaw_rad))))
         if near and turned < tracker.options.update_rad:
-            return None, replace(state, gathered=count, sum_uT=total)
-    reading = Reading(step.number, step.t_s, total / count, count, place, float(yaw_rad), step.device_to_frame)
-    return reading, replace(state, gathered=0, sum_uT=None)
+            return None, replace(state, samples=count, gathered=total)
+    mean = total / count
+    reading = Reading(step.number, float(mean[3]), mean[4:], count, mean[:3], float(yaw_rad), step.device_to_frame)
+    return reading, replace(state, samples=0, gathered=None)
 
 
 def _predict_nothing(tracker: Tracker, state: TrackState, before: Reading | None, reading: Reading) -> TrackState:
@@ -321,9 +337,7 @@ def _mixed(state: TrackState, taken: TrackState, elsewhere: float) -> TrackState
     ])  # fmt: skip
     particles = Particles(np.concatenate([old.rows, new.rows]), np.concatenate([old.floor, new.floor]), log_weight)
     nodes = [node for node in state.lag.nodes if node.number in {each.number for each in taken.lag.nodes}]
-    mine, theirs = (
-        [k for k, node in enumerate(lag.nodes) if node in nodes] for lag in (state.lag, taken.lag)
-    )
+    mine, theirs = ([k for k, node in enumerate(lag.nodes) if node in nodes] for lag in (state.lag, taken.lag))
     lag = Lag(
         tuple(nodes),
         np.concatenate([state.lag.position_m[mine], taken.lag.position_m[theirs]], axis=1),
@@ -345,6 +359,10 @@ def _judged(tracker: Tracker, state: TrackState) -> TrackState:
     if sure >= options.converged_probability and own_radius_m <= options.converged_radius_m:
         at_m = state.path_m if state.converged_at_m is None else state.converged_at_m
         return replace(state, state="converged", converged_at_m=at_m)
-    if state.state == "converged" and sure >= options.lost_probability and own_radius_m <= 2 * options.converged_radius_m:
+    if (
+        state.state == "converged"
+        and sure >= options.lost_probability
+        and own_radius_m <= 2 * options.converged_radius_m
+    ):
         return state
     return replace(state, state="searching" if state.converged_at_m is None else "lost")
