@@ -6,6 +6,7 @@ belief goes in, a belief comes out: nothing is changed in place.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from app.geometry import Array
 __all__ = [
     "POSITION", "DiscreteModel", "GaussianBelief", "Update", "condition_on_position", "constant_velocity", "predict",
     "rotate_velocity", "smooth", "update", "van_loan",
+    "velocity_rotation",
 ]  # fmt: skip
 
 POSITION = np.eye(2, 4)
@@ -63,6 +65,7 @@ class Update(NamedTuple):
         return float(self.innovation @ np.linalg.solve(self.innovation_covariance, self.innovation))
 
 
+@lru_cache(maxsize=256)
 def constant_velocity(dt_s: float, acceleration_psd_m2_s3: float) -> DiscreteModel:
     """The closed form for `[x, y, vx, vy]` driven by white acceleration (Storms, L542-546, eqs. 3.3, 3.4).
 
@@ -71,11 +74,14 @@ def constant_velocity(dt_s: float, acceleration_psd_m2_s3: float) -> DiscreteMod
     """
     eye, zero = np.eye(2), np.zeros((2, 2))
     q = acceleration_psd_m2_s3
-    return DiscreteModel(
+    model = DiscreteModel(
         transition=np.block([[eye, dt_s * eye], [zero, eye]]),
         control=np.vstack([0.5 * dt_s**2 * eye, dt_s * eye]),
         process_noise=q * np.kron([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]], eye),
     )
+    for each in (model.transition, model.control, model.process_noise):
+        each.setflags(write=False)  # callers share it
+    return model
 
 
 def van_loan(F: Array, B: Array, G: Array, Q: Array, dt_s: float) -> DiscreteModel:
@@ -99,14 +105,20 @@ def predict(belief: GaussianBelief, model: DiscreteModel, control: Array | None 
     return GaussianBelief(mean, model.transition @ belief.covariance @ model.transition.T + model.process_noise)
 
 
-def rotate_velocity(belief: GaussianBelief, turn_rad: float) -> GaussianBelief:
-    """The vehicle turned by that much, counter-clockwise: the velocity of `[x, y, vx, vy]` turns with it.
-
-    How the source encodes a turn command is not stated (Storms, L720); this is exact whatever the speed.
-    """
+def velocity_rotation(turn_rad: float) -> Array:
+    """(4, 4) that turns the velocity of `[x, y, vx, vy]` counter-clockwise and leaves the position."""
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     turned = np.eye(4)
     turned[2:, 2:] = [[c, -s], [s, c]]
+    return turned
+
+
+def rotate_velocity(belief: GaussianBelief, turn_rad: float) -> GaussianBelief:
+    """The vehicle turned by that much, counter-clockwise.
+
+    How the source encodes a turn command is not stated (Storms, L720); this is exact whatever the speed.
+    """
+    turned = velocity_rotation(turn_rad)
     return GaussianBelief(turned @ belief.mean, turned @ belief.covariance @ turned.T)
 
 

@@ -20,6 +20,7 @@ from app.tracking.kalman import (
     rotate_velocity,
     smooth,
     update,
+    velocity_rotation,
 )
 from app.tracking.map_cells import MapCells
 from app.tracking.position_fix import FixSettings, PositionFix, matched_fix, ml_fix
@@ -77,6 +78,10 @@ class MlKalman:
         turned = rotate_velocity(belief, turn_rad) if turn_rad else belief
         return predict(turned, constant_velocity(dt_s, self.acceleration_psd_m2_s3), control_m_s2)
 
+    def transition(self, dt_s: float, turn_rad: float = 0.0) -> Array:
+        """(4, 4) of `advance`, for a smoother."""
+        return constant_velocity(dt_s, self.acceleration_psd_m2_s3).transition @ velocity_rotation(turn_rad)
+
     def correct(self, belief: GaussianBelief, reading_uT: Array) -> Corrected:
         """Use one reading (c,), unless the map knows nothing here or a gate refuses the fix."""
         make = ml_fix if self.correct_by == "fix" else matched_fix
@@ -112,13 +117,6 @@ class MlKalman:
         now_s, angle_rad = from_s, 0.0
         for at_s, turn_rad in [*(turn for turn in turns if from_s <= turn[0] < to_s), (to_s, 0.0)]:
             belief = self.advance(belief, at_s - now_s, turn_rad=angle_rad)
-            transition = _step(at_s - now_s, angle_rad) @ transition
+            transition = self.transition(at_s - now_s, angle_rad) @ transition
             now_s, angle_rad = at_s, turn_rad
         return belief, transition
-
-
-def _step(dt_s: float, turn_rad: float) -> Array:
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
-    turned = np.eye(4)
-    turned[2:, 2:] = [[c, -s], [s, c]]
-    return np.asarray(constant_velocity(dt_s, 0.0).transition @ turned)
