@@ -1,4 +1,4 @@
-"""A leader and its follower in Storms' corridor: true vehicles, what they read, and how the follower fares (Storms 1.14-1.18)."""
+"""A leader and its follower in Storms' corridor: true vehicles, what they read, how one fares (Storms 1.14-1.18)."""
 
 from dataclasses import dataclass
 
@@ -90,7 +90,7 @@ def lead(
     reading = corridor.field_uT(places.reshape(-1, 2)).reshape(places.shape[0], sensors, 3)
     reading += noise_uT * rng.normal(size=reading.shape)
     estimated = np.array([each.position_m for each in filtered])
-    t_s = np.arange(len(state)) * _SAMPLE_STEPS * _STEP_S
+    t_s = np.asarray(np.arange(len(state)) * (_SAMPLE_STEPS * _STEP_S))
     log = LeaderLog(t_s, estimated, heading, reading, offsets)
     return LeaderRun(log, state[:, :2], np.array([each.position_m for each in later]), round(turn / _SAMPLE_STEPS))
 
@@ -112,7 +112,8 @@ def follow(
     """Drive one follower until it has come 16 m along the side hallway, is out of the hallways, or out of time.
 
     The leader's turn is carried out where the follower thinks it passes `turn_place_m` (2,), the leader's estimate of
-    it; None: it was not shared. `reset` puts a vehicle that leaves the hallways `reset_m` beyond the centre line (Storms, L791); the filter is not told.
+    it; None: it was not shared. `reset` puts a vehicle that leaves the hallways `reset_m` beyond the centre line
+    (Storms, L791); the filter is not told.
     """
     path_m = follower.path_m
     true = np.concatenate([leader.true_m[0], [0.5, 0.0]])
@@ -146,7 +147,7 @@ def follow(
 
 
 def _whole_walk(rng: np.random.Generator, sigma_a: float) -> tuple[Array, int]:
-    """True states (n, 4) every 0.5 s of a walk that comes 16 m along the side hallway, and the step it turned before."""
+    """True states (n, 4) every 0.5 s of a walk as long as a complete run, and the step it turned before."""
     while True:
         walks = walk_corridor(rng, 16, sigma_a)
         whole = np.flatnonzero(-walks.state[:, -1, 1] - WIDTH_M >= COMPLETE_M)

@@ -99,8 +99,7 @@ def surveyed_cells(
         drift = make_corridor(rng).field_uT(nodes.reshape(-1, 2)) - _EARTH_UT
         values += drift * drift_sd_uT / drift[inside(nodes.reshape(-1, 2))].std(axis=0)
     values = values.reshape(*nodes.shape[:2], 3)
-    x, y = (np.arange(0, 10 * n + 1) * FINE_M for n in (108, 51))
-    y -= DEPTH_M
+    x, y = np.asarray(np.arange(1081) * FINE_M), np.asarray(np.arange(511) * FINE_M - DEPTH_M)
     mean = np.zeros((len(y), len(x), 3))
     side, main = np.s_[:, 1020:], np.s_[450:, :]
     for c in range(3):

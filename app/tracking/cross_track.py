@@ -1,4 +1,4 @@
-"""Keeping to a path: the error across it, the controller that steers, and the frame it is scored in (Storms 1.15-1.19)."""
+"""Keeping to a path: the error across it, the controller that steers, and the frame of scores (Storms 1.15-1.19)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -67,7 +67,7 @@ def polyline(path_m: Array) -> Array:
     """
     moved = np.concatenate([[True], np.any(np.diff(path_m, axis=0) != 0.0, axis=1)])
     assert moved.sum() >= 2, "a path needs two different points"
-    return path_m[moved]
+    return np.asarray(path_m[moved])
 
 
 def cross_track(path_m: Array, point_m: Array) -> CrossTrack:

@@ -1,4 +1,4 @@
-"""The linear Kalman filter as small functions, and the constant-velocity model of a vehicle on a floor (Storms 1.5-1.8).
+"""The linear Kalman filter as small functions, and a vehicle of constant velocity on a floor (Storms 1.5-1.8).
 
 The state of that model is `[x, y, vx, vy]` in the building frame, m and m/s; the source keeps (Y, X) with z down. A
 belief goes in, a belief comes out: nothing is changed in place.
@@ -77,7 +77,7 @@ def constant_velocity(dt_s: float, acceleration_psd_m2_s3: float) -> DiscreteMod
     model = DiscreteModel(
         transition=np.block([[eye, dt_s * eye], [zero, eye]]),
         control=np.vstack([0.5 * dt_s**2 * eye, dt_s * eye]),
-        process_noise=q * np.kron([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]], eye),
+        process_noise=np.asarray(q * np.kron([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]], eye)),
     )
     for each in (model.transition, model.control, model.process_noise):
         each.setflags(write=False)  # callers share it
@@ -131,7 +131,7 @@ def update(
     """
     P = belief.covariance
     S = H @ P @ H.T + R
-    gain = np.linalg.solve(S, H @ P).T
+    gain = np.asarray(np.linalg.solve(S, H @ P).T, dtype=np.float64)
     innovation = measured - H @ belief.mean
     left = np.eye(len(P)) - gain @ H
     covariance = left @ P @ left.T + gain @ R @ gain.T if form == "joseph" else left @ P

@@ -18,8 +18,8 @@ from app.tracking.map_cells import MapCells
 from app.tracking.ml_kalman import MlKalman
 
 __all__ = [
-    "COMPLETE_M", "SENSOR_SPACING_M", "SUCCESSFUL_M", "Follower", "LeaderLog", "Outcome", "Steering", "lateral_offsets_m", "leader_map",
-    "outcome_of", "sensor_places_m", "turn_command_m_s2",
+    "COMPLETE_M", "SENSOR_SPACING_M", "SUCCESSFUL_M", "Follower", "LeaderLog", "Outcome", "Steering",
+    "lateral_offsets_m", "leader_map", "outcome_of", "sensor_places_m", "turn_command_m_s2",
 ]  # fmt: skip
 
 SENSOR_SPACING_M = 0.381
@@ -76,7 +76,7 @@ class Follower:
 
 def lateral_offsets_m(sensors: int, spacing_m: float = SENSOR_SPACING_M) -> Array:
     """(s,) offsets of a row of sensors about the vehicle's middle; the source does not place its fourth."""
-    return spacing_m * (np.arange(sensors) - (sensors - 1) / 2.0)
+    return np.asarray(spacing_m * (np.arange(sensors) - (sensors - 1) / 2.0))
 
 
 def sensor_places_m(position_m: Array, heading_rad: Array, offset_m: Array) -> Array:

@@ -39,12 +39,12 @@ class MapCells:
     @property
     def x_m(self) -> Array:
         """(nx,) of the cell centres."""
-        return self.origin_m[0] + self.resolution_m * np.arange(self.known.shape[1])
+        return np.asarray(self.origin_m[0] + self.resolution_m * np.arange(self.known.shape[1]))
 
     @property
     def y_m(self) -> Array:
         """(ny,) of the cell centres."""
-        return self.origin_m[1] + self.resolution_m * np.arange(self.known.shape[0])
+        return np.asarray(self.origin_m[1] + self.resolution_m * np.arange(self.known.shape[0]))
 
     def norm(self) -> "MapCells":
         """The map of the magnitude: its variance is that of the component along the field."""

@@ -52,7 +52,9 @@ class Track:
         return np.asarray(np.array(places).reshape(-1, 2) - self.mean[:, :2])
 
 
-def start_belief(position_m: Array, velocity_m_s: Array, position_sd_m: float, velocity_sd_m_s: float) -> GaussianBelief:
+def start_belief(
+    position_m: Array, velocity_m_s: Array, position_sd_m: float, velocity_sd_m_s: float
+) -> GaussianBelief:
     """A first belief with independent errors; the source gives 1.5 m and no velocity sd (Storms, L804-819)."""
     variances = [position_sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
     return GaussianBelief(np.concatenate([position_m, velocity_m_s]), np.diag(variances))
