@@ -65,7 +65,7 @@ LITERAL_NOISE = SensorNoise(force_sd_m_s2=0.316, rate_sd_rad_s=0.1)
 
 
 class SensorLog(NamedTuple):
-    """Readings at every step: specific force, turn rate (n, 3), body axes; magnitude (n,); what GPS would say (n, 3)."""
+    """Readings at every step: specific force and turn rate (n, 3) of the body; magnitude (n,); GPS's answers (n, 3)."""
 
     force_m_s2: Array
     rate_rad_s: Array

@@ -3,7 +3,7 @@
 GMA matches a history: of 11 x 11 paths parallel to the one believed, that of the least mean absolute deviation. NEDP
 moves its place to the nearest cell that agrees with the last reading. Together they are the source's "GAN", geomagnetic
 aided navigation. Both are drawn to the window's centre, which is the filter's own belief; as a measurement they feed a
-filter its own error. `window_fix` is a posterior over a window of three sigmas, refused where it reaches the border.
+filter its own error. `window_fix` is a posterior over a window sized by the prior, refused where drawn to its border.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,7 +22,17 @@ __all__ = [
     "square_offsets_m", "window_fix",
 ]  # fmt: skip
 
-WINDOW_SETTINGS = FixSettings(reach_sigmas=3.0, least_reach_m=0.5, most_reach_m=6.0, most_border_mass=0.05)
+WINDOW_SETTINGS = FixSettings(
+    reach_sigmas=5.0,
+    least_reach_m=0.0,
+    most_reach_m=8.0,
+    resolve_prior=True,
+    innovation_gate=True,
+    most_border_mass=0.05,
+)
+"""The source's three sigmas cut off 3 % of the variance with every reading, many times a second; five do not. What
+three are for, to refuse what is drawn too far, the gate does.
+"""
 
 
 class ContourFix(NamedTuple):
@@ -123,9 +133,9 @@ def window_fix(
     noise_sd_uT: float,
     settings: FixSettings = WINDOW_SETTINGS,
 ) -> PositionFix | None:
-    """Moments of prior times likelihood over a window of three prior sigmas (Cuenca, L611, eq. 3.3; L915).
+    """Moments of prior times likelihood over a window sized by the prior (Cuenca, L611, eq. 3.3; L915).
 
     The prior is in it: condition a belief on it (`kalman.condition_on_position`), do not fuse it again. `refused` says
-    "border" where the window has cut the posterior off.
+    "innovation" or "border" where the reading draws the posterior farther than the prior allows.
     """
     return matched_fix(cells, reading_uT, mean_m, covariance_m2, replace(settings, noise_sd_uT=noise_sd_uT))

@@ -15,18 +15,22 @@ from app.tracking.map_cells import MapCells
 
 __all__ = ["GridPosterior", "grid_posterior", "local_maxima", "log_likelihood", "log_prior", "search_half_m"]
 
+_MOST_CELLS = 2500
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridPosterior:
     """The cells searched; misfit, log likelihood and log posterior (ny, nx), -inf (misfit: inf) where unknown.
 
-    `misfit` is the sum of squared residuals over their variances: chi-square under a correct model.
+    `misfit` is the sum of squared residuals over their variances: chi-square under a correct model. `resolved`:
+    cells are points of a lattice fine enough for sums to be integrals; else each is a square of its mass.
     """
 
     cells: MapCells
     misfit: Array
     log_likelihood: Array
     log_posterior: Array
+    resolved: bool = False
 
     @property
     def best(self) -> tuple[int, int]:
@@ -45,14 +49,14 @@ class GridPosterior:
         return np.asarray(mass / mass.sum())
 
     def moments(self) -> tuple[Array, Array]:
-        """Mean (2,) and covariance (2, 2) of the position, each cell a square of its mass."""
+        """Mean (2,) and covariance (2, 2) of the position."""
         mass, x, y = self.mass(), self.cells.x_m, self.cells.y_m
         of_x, of_y = mass.sum(axis=0), mass.sum(axis=1)
         mean = np.array([of_x @ x, of_y @ y])
         u, v = x - mean[0], y - mean[1]
         cross = float(v @ mass @ u)
         covariance = np.array([[of_x @ u**2, cross], [cross, of_y @ v**2]])
-        return mean, covariance + np.eye(2) * self.cells.resolution_m**2 / 12.0
+        return mean, covariance + (not self.resolved) * np.eye(2) * self.cells.resolution_m**2 / 12.0
 
     def border_mass(self) -> float:
         """Probability of the outermost cells of the window: what it has probably cut off."""
@@ -102,17 +106,33 @@ def grid_posterior(
     *,
     map_variance: bool = True,
     use_prior: bool = True,
+    resolve_prior: bool = False,
 ) -> GridPosterior | None:
     """Prior times likelihood of one reading (c,) uT over the cells within `half_m` (2,) (Storms, L575).
 
-    Without `use_prior` all cells of the window weigh alike. None where no cell of it is known: there is no fix.
+    Without `use_prior` all cells of the window weigh alike. `resolve_prior` takes a finer lattice where cells are wider
+    than a quarter of the prior's sd, and counts half of what the field changes across a cell as an sd. None where no
+    cell is known: there is no fix.
     """
-    window = cells.window(mean_m, half_m)
+    window = _resolved(cells, mean_m, covariance_m2, half_m) if resolve_prior else cells.window(mean_m, half_m)
     if window is None or not window.known.any():
         return None
     misfit, likelihood = log_likelihood(window, reading_uT, noise_sd_uT, map_variance)
     prior = log_prior(window, mean_m, covariance_m2) if use_prior else 0.0
-    return GridPosterior(window, misfit, likelihood, likelihood + prior)
+    return GridPosterior(window, misfit, likelihood, likelihood + prior, resolve_prior)
+
+
+def _resolved(cells: MapCells, mean_m: Array, covariance_m2: Array, half_m: Array) -> MapCells | None:
+    """The window, its lattice as fine as the prior wants but for `_MOST_CELLS`, its variance with that within cells."""
+    fine_m = 0.25 * float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[0]))
+    spacing_m = max(fine_m, float(np.sqrt(4.0 * np.prod(half_m) / _MOST_CELLS)))
+    coarse = spacing_m >= cells.resolution_m
+    window = cells.window(mean_m, half_m) if coarse else cells.resampled(mean_m, half_m, spacing_m)
+    if window is None or min(window.known.shape) < 2:
+        return window
+    squared = sum(np.square(np.gradient(window.mean_uT, axis=axis)) for axis in (0, 1))
+    within = 0.25 * np.where(np.isfinite(squared), squared, 0.0)
+    return MapCells(window.origin_m, window.resolution_m, window.mean_uT, window.variance_uT2 + within, window.known)
 
 
 def local_maxima(log_posterior: Array, within: float) -> NDArray[np.int64]:

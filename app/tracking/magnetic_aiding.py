@@ -1,9 +1,10 @@
-"""The loop that carries a drone through an outage of GPS: EKF, GPS while it lasts, then the map (Cuenca, L763, L1049)."""
+"""The loop that carries a drone through an outage of GPS: EKF, GPS while it lasts, then the map (Cuenca, L1049)."""
 
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.tracking.contour_matching import (
@@ -34,7 +35,7 @@ Method = Literal["none", "gma", "gan", "window"]
 @dataclass(frozen=True, slots=True, eq=False)
 class Aiding:
     """method: what corrects when GPS gives no position; "window" is ours
-    feed: "measurement" of variance `fix_variance_m2`, or "state": the place overwrites the position, as without a filter
+    feed: "measurement" of variance `fix_variance_m2`, or "state": the place overwrites the position, without a filter
     always: match while GPS gives positions too (the source's GMA and GAN rows under "position")
     sigma_uT, tolerance_uT: noise of the magnitude; NEDP's tolerance (None: from the map's slope)
     every: steps from one magnetometer reading to the next; history: readings that GMA remembers
@@ -143,7 +144,8 @@ def _with_window(belief: GaussianBelief, cells: MapCells, norm_uT: float, aiding
     return condition_on_position(belief, fix.position_m, fix.covariance_m2)
 
 
-def _without_position(position_m: Array, patience: int) -> Array:
+def _without_position(position_m: Array, patience: int) -> NDArray[np.bool_]:
     """(n,) whether no position came within the last `patience` steps."""
-    last = np.maximum.accumulate(np.where(np.isfinite(position_m[:, 0]), np.arange(len(position_m)), -patience - 1))
-    return np.arange(len(position_m)) - last > patience
+    step = np.arange(len(position_m))
+    last = np.maximum.accumulate(np.where(np.isfinite(position_m[:, 0]), step, -patience - 1))
+    return np.asarray(step - last > patience)

@@ -67,18 +67,39 @@ class MapCells:
         part = np.s_[j0:j1, i0:i1]
         return MapCells(origin_m, self.resolution_m, self.mean_uT[part], self.variance_uT2[part], self.known[part])
 
+    def resampled(self, centre_m: Array, half_m: Array, spacing_m: float) -> "MapCells":
+        """A lattice of its own about a place, as far as `half_m` (2,), values bilinear: finer than the cells, say."""
+        nx, ny = np.ceil(half_m / spacing_m).astype(np.int64)
+        x, y = centre_m[0] + spacing_m * np.arange(-nx, nx + 1), centre_m[1] + spacing_m * np.arange(-ny, ny + 1)
+        mean, variance = (self._bilinear(v, x, y[:, None]) for v in (self.mean_uT, self.variance_uT2))
+        known = np.isfinite(mean[..., 0])
+        return MapCells((float(x[0]), float(y[0])), spacing_m, mean, variance, known)
+
     def at(self, points_m: Array) -> Array:
         """Bilinear values (n, c) at points (n, 2), uT; NaN where one of the four cells around is unknown."""
-        ny, nx = self.known.shape
-        place = (points_m - np.asarray(self.origin_m)) / self.resolution_m
-        corner = np.floor(place).astype(np.int64)
-        inside = np.all((place >= 0.0) & (place <= [nx - 1, ny - 1]), axis=1)
-        i, j = (np.clip(corner[:, axis], 0, max(n - 2, 0)) for axis, n in ((0, nx), (1, ny)))
-        u, v = place[:, 0] - i, place[:, 1] - j
-        out = np.zeros((len(points_m), self.mean_uT.shape[2]))
-        for dj, di, weight in ((0, 0, (1 - v) * (1 - u)), (0, 1, (1 - v) * u), (1, 0, v * (1 - u)), (1, 1, v * u)):
-            jj, ii = np.minimum(j + dj, ny - 1), np.minimum(i + di, nx - 1)
-            used = weight != 0.0
-            inside &= self.known[jj, ii] | ~used
-            out += np.where(used[:, None], weight[:, None] * self.mean_uT[jj, ii], 0.0)
-        return np.where(inside[:, None], out, np.nan)
+        return self._bilinear(self.mean_uT, points_m[:, 0], points_m[:, 1])
+
+    def _bilinear(self, values: Array, x_m: Array, y_m: Array) -> Array:
+        """Values (..., c) of a layer (ny, nx, c) at coordinates that broadcast."""
+        i, u, inside_x = _between(x_m, self.origin_m[0], self.resolution_m, self.known.shape[1])
+        j, v, inside_y = _between(y_m, self.origin_m[1], self.resolution_m, self.known.shape[0])
+        inside = inside_x & inside_y
+        out = np.zeros((*inside.shape, values.shape[2]))
+        for jj, wv in ((j, 1.0 - v), (j + 1, v)):
+            for ii, wu in ((i, 1.0 - u), (i + 1, u)):
+                row, column = np.minimum(jj, self.known.shape[0] - 1), np.minimum(ii, self.known.shape[1] - 1)
+                weight = wv * wu
+                used = weight != 0.0
+                inside &= self.known[row, column] | ~used
+                out += np.where(used[..., None], weight[..., None] * values[row, column], 0.0)
+        out[~inside] = np.nan
+        return out
+
+
+def _between(
+    at_m: Array, origin_m: float, resolution_m: float, count: int
+) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+    """The cell centre below each coordinate, the fraction of the way to the next, and whether it is on the map."""
+    place = (at_m - origin_m) / resolution_m
+    below = np.clip(place.astype(np.int64), 0, max(count - 2, 0))
+    return below, place - below, (place >= 0.0) & (place <= count - 1)

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
-from scipy.stats import chi2
+from scipy.special import chdtri, ndtr
 
 from app.geometry import Array
 from app.tracking.grid_posterior import GridPosterior, grid_posterior, local_maxima, search_half_m
@@ -35,6 +34,7 @@ class FixSettings:
     least_sd_m: of a fix per axis; None: that of a cell
     innovation_gate, fit_gate, ambiguity_veto: proposals of the source, off as there (Storms, L697, L800); what they
         refuse has `gate_probability` of happening by chance, or a rival one tenth as likely
+    resolve_prior: search a finer lattice where cells are wide against the prior, and count the change across a cell
     most_border_mass: `matched_fix` refuses a posterior that has more than this at the border of its window
     """
 
@@ -50,6 +50,7 @@ class FixSettings:
     fit_gate: bool = False
     ambiguity_veto: bool = False
     gate_probability: float = 0.0027
+    resolve_prior: bool = False
     most_border_mass: float = 1.0
 
 
@@ -137,6 +138,7 @@ def _search(
         settings.noise_sd_uT,
         map_variance=settings.map_variance,
         use_prior=settings.use_prior,
+        resolve_prior=settings.resolve_prior,
     )
 
 
@@ -195,9 +197,9 @@ def _squared_distance(off_m: Array, covariance_m2: Array) -> Array:
 def _refusal(found: FixDiagnostics, settings: FixSettings) -> Refusal | None:
     """The first of the switched-on gates that a fix does not pass."""
     p = settings.gate_probability
-    if settings.innovation_gate and found.squared_distance > chi2.isf(p, 2):
+    if settings.innovation_gate and found.squared_distance > chdtri(2, p):
         return "innovation"
-    if settings.fit_gate and found.misfit > chi2.isf(p, found.components):
+    if settings.fit_gate and found.misfit > chdtri(found.components, p):
         return "fit"
     if settings.ambiguity_veto and found.rival_log_ratio < _AS_LIKELY:
         return "ambiguous"
