@@ -63,6 +63,14 @@ class GmaHistory:
     length: int = 100
     residual_uT: Array = field(default_factory=lambda: np.empty((0, 0)))
 
+    @property
+    def full(self) -> bool:
+        return bool(self.residual_uT.shape[1] >= self.length)
+
+    def forgotten(self) -> "GmaHistory":
+        """Without its residuals: what they were offset from has moved."""
+        return GmaHistory(self.offset_m, self.length)
+
     def push(self, cells: MapCells, centre_m: Array, norm_uT: float) -> "GmaHistory":
         """With one more reading, taken where the filter believes to be: `cells` hold the magnitude."""
         residual = cells.at(centre_m + self.offset_m) - norm_uT

@@ -38,12 +38,15 @@ class Aiding:
     feed: "measurement" of variance `fix_variance_m2`, or "state": the place overwrites the position, without a filter
     always: match while GPS gives positions too (the source's GMA and GAN rows under "position")
     sigma_uT, tolerance_uT: noise of the magnitude; NEDP's tolerance (None: from the map's slope)
+    batches: match only when the history is full, and forget it then. Else, as in the source, an offset is applied with
+        each reading that the history keeps showing after it was applied: one error is corrected many times over
     every: steps from one magnetometer reading to the next; history: readings that GMA remembers
     """
 
     method: Method = "none"
     feed: Literal["measurement", "state"] = "measurement"
     always: bool = False
+    batches: bool = False
     fix_variance_m2: float = 0.25
     sigma_uT: float = 0.0707
     tolerance_uT: float | None = None
@@ -106,7 +109,9 @@ def navigate(
                 match = _match(history, cells, belief.position_m, norm_uT[k], aiding)
                 if match is not None:
                     off_m[k] = match.position_m - belief.position_m
-                    belief = _with_match(belief, match, aiding) if used else belief
+                    if used and (not aiding.batches or history.full):
+                        belief = _with_match(belief, match, aiding)
+                        history = history.forgotten() if aiding.batches else history
         belief = predict_inertial(belief, force_m_s2[k], rate_rad_s[k], dt_s, Q)
     return AidedTrack(state, sd_m, off_m, refused)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from app.geometry import Array
 from app.tracking.kalman import (
@@ -26,6 +27,8 @@ from app.tracking.map_cells import MapCells
 from app.tracking.position_fix import FixSettings, PositionFix, matched_fix, ml_fix
 
 __all__ = ["Corrected", "MlKalman", "Track", "start_belief"]
+
+_WIDER, _WIDENINGS = 4.0, 3
 
 
 class Corrected(NamedTuple):
@@ -65,13 +68,16 @@ class MlKalman:
     """A map, how fixes are made on it, and how a vehicle moves.
 
     `correct_by` "fix" is the source: the likeliest cell as a measurement. "moments" takes the posterior over cells as
-    the updated position, in which the prior counts once (Storms 3, "prior counted twice").
+    the updated position, in which the prior counts once (Storms 3, "prior counted twice"). `recover`, ours: where the
+    likeliest cell does not fit the reading the vehicle is not where it is believed to be, so the belief is widened until
+    one does; a turn nobody told of is found that way.
     """
 
     cells: MapCells
     settings: FixSettings
     acceleration_psd_m2_s3: float
     correct_by: Literal["fix", "moments"] = "fix"
+    recover: bool = False
 
     def advance(
         self, belief: GaussianBelief, dt_s: float, control_m_s2: Array | None = None, turn_rad: float = 0.0
@@ -86,13 +92,21 @@ class MlKalman:
 
     def correct(self, belief: GaussianBelief, reading_uT: Array) -> Corrected:
         """Use one reading (c,), unless the map knows nothing here or a gate refuses the fix."""
-        make = ml_fix if self.correct_by == "fix" else matched_fix
-        fix = make(self.cells, reading_uT, belief.position_m, belief.position_covariance_m2, self.settings)
+        fix = self._fix(belief, reading_uT)
+        for _ in range(_WIDENINGS if self.recover else 0):
+            if fix is not None and _fits(fix, self.settings.gate_probability):
+                break
+            belief = GaussianBelief(belief.mean, _WIDER * belief.covariance)
+            fix = self._fix(belief, reading_uT)
         if fix is None or fix.refused is not None:
             return Corrected(belief, fix)
         if self.correct_by == "fix":
             return Corrected(update(belief, fix.position_m, POSITION, fix.covariance_m2).belief, fix)
         return Corrected(condition_on_position(belief, fix.position_m, fix.covariance_m2), fix)
+
+    def _fix(self, belief: GaussianBelief, reading_uT: Array) -> PositionFix | None:
+        make = ml_fix if self.correct_by == "fix" else matched_fix
+        return make(self.cells, reading_uT, belief.position_m, belief.position_covariance_m2, self.settings)
 
     def track(
         self, start: GaussianBelief, readings_uT: Array, dt_s: float, turns: Sequence[tuple[float, float]] = ()
@@ -122,3 +136,7 @@ class MlKalman:
             transition = self.transition(at_s - now_s, angle_rad) @ transition
             now_s, angle_rad = at_s, turn_rad
         return belief, transition
+
+
+def _fits(fix: PositionFix, probability: float) -> bool:
+    return bool(fix.diagnostics.best_misfit <= chdtri(fix.diagnostics.components, probability))

@@ -56,6 +56,7 @@ class FixSettings:
 
 class FixDiagnostics(NamedTuple):
     """misfit: least squared residual over variance of any cell, chi-square with `components` degrees of freedom
+    best_misfit: that of the likeliest cell, prior and all
     peaks: local maxima of the posterior within three prior sigmas
     rival_log_ratio: how far the best of them more than three sigmas of the fix away is behind; inf if alone
     innovation_m: from the prior mean; squared_distance: that over its covariance
@@ -63,6 +64,7 @@ class FixDiagnostics(NamedTuple):
     """
 
     misfit: float
+    best_misfit: float
     components: int
     peaks: int
     rival_log_ratio: float
@@ -166,6 +168,7 @@ def _judged(
     peaks, rival = _rivals(posterior, position_m, spread_m2, mean_m, prior_m2)
     diagnostics = FixDiagnostics(
         float(posterior.misfit.min()),
+        float(posterior.misfit[posterior.best]),
         posterior.cells.mean_uT.shape[2],
         peaks,
         rival,
