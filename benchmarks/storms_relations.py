@@ -350,10 +350,10 @@ def of_convoys(corridors: list[Corridor], weak: list[Corridor], count: int, seed
             order(sum(shared.values()), sum(success.values())),
         ),
         Row(
-            "without the turn command none turns",
+            "the turn command is needed: successful with, without",
             "-",
-            f"{silent.at_least('past turn'):.0%}",
-            says(silent.at_least("past turn") < 0.1),
+            f"{success[4, True]:.0%}, {silent.at_least('successful'):.0%}",
+            order(success[4, True], silent.at_least("successful")),
         ),
         Row(
             "S18 successful run: across the path",

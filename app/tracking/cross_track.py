@@ -75,17 +75,17 @@ def cross_track(path_m: Array, point_m: Array) -> CrossTrack:
 
     Segments rather than nearest points, so that nothing jumps at a corner.
     """
-    start, step = path_m[:-1], np.diff(path_m, axis=0)
-    squared = np.einsum("ni,ni->n", step, step)
-    share = np.clip(np.einsum("ni,ni->n", point_m - start, step) / squared, 0.0, 1.0)
-    closest = start + share[:, None] * step
-    off = closest - point_m
-    k = int(np.argmin(np.einsum("ni,ni->n", off, off)))
+    start, (dx, dy) = path_m[:-1], np.diff(path_m, axis=0).T
+    squared = dx * dx + dy * dy
+    x, y = start[:, 0] - point_m[0], start[:, 1] - point_m[1]
+    share = np.minimum(np.maximum(-(x * dx + y * dy) / squared, 0.0), 1.0)
+    x, y = x + share * dx, y + share * dy
+    k = int(np.argmin(x * x + y * y))
     length = np.sqrt(squared)
-    tangent = step[k] / length[k]
-    side = 1.0 if tangent[0] * off[k, 1] - tangent[1] * off[k, 0] >= 0.0 else -1.0
+    tangent, off = np.array([dx[k], dy[k]]) / length[k], np.array([x[k], y[k]])
+    side = 1.0 if tangent[0] * off[1] - tangent[1] * off[0] >= 0.0 else -1.0
     along = float(length[:k].sum() + share[k] * length[k])
-    return CrossTrack(closest[k], tangent, side * float(np.hypot(*off[k])), k, along)
+    return CrossTrack(point_m + off, tangent, side * float(np.hypot(*off)), k, along)
 
 
 def pid_step(

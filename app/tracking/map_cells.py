@@ -100,6 +100,6 @@ def _between(
     at_m: Array, origin_m: float, resolution_m: float, count: int
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
     """The cell centre below each coordinate, the fraction of the way to the next, and whether it is on the map."""
-    place = (at_m - origin_m) / resolution_m
+    place = np.round((at_m - origin_m) / resolution_m, 9)  # a centre is a centre, whatever its rounding
     below = np.clip(place.astype(np.int64), 0, max(count - 2, 0))
     return below, place - below, (place >= 0.0) & (place <= count - 1)

@@ -69,8 +69,8 @@ class MlKalman:
 
     `correct_by` "fix" is the source: the likeliest cell as a measurement. "moments" takes the posterior over cells as
     the updated position, in which the prior counts once (Storms 3, "prior counted twice"). `recover`, ours: where the
-    likeliest cell does not fit the reading the vehicle is not where it is believed to be, so the belief is widened until
-    one does; a turn nobody told of is found that way.
+    likeliest cell does not fit the reading, the vehicle is not where it is believed to be, and the belief is widened
+    until one does; a turn nobody told of is found that way.
     """
 
     cells: MapCells
