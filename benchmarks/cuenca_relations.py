@@ -4,8 +4,9 @@ His Table 4.2 compares an EKF with GPS, without it from 12 to 30 s, and then aid
 runs here fly tracks S and O of 40 s over two fields: his polynomial, whose slope is about as large per metre as the
 sensor's noise, and a map with the slopes of a building. He prints neither the variance of a magnetic fix, nor the
 length of GMA's history, nor NEDP's tolerance; ours are fixed below and are the same in all rows. "window" is what we
-use instead: moments of prior times likelihood within three sigmas. A row agrees, does not, or is undecided where two
-standard errors over runs and tracks reach across zero.
+use instead: moments of prior times likelihood over a window that the prior sizes. A row agrees, does not, or is
+undecided where two standard errors over runs and tracks reach across zero. The window's width and lattice, and
+matching in batches, were settled on runs of seed 1.
 
     python benchmarks/cuenca_relations.py [--runs N] [--seed S]
 """
@@ -28,9 +29,11 @@ from app.synthetic.softball_field import (
     polynomial_cells,
     sense,
 )
+from app.tracking.contour_matching import window_fix
 from app.tracking.inertial_ekf import CUENCA_NOISE, InertialNoise
 from app.tracking.kalman import GaussianBelief
 from app.tracking.magnetic_aiding import AidedTrack, Aiding, GpsReadings, navigate
+from app.tracking.map_cells import MapCells
 
 OUTAGE_S = (12.0, 30.0)  # Cuenca, L1049
 GPS_STEPS = 20  # 5 Hz (Cuenca, L774)
@@ -245,9 +248,6 @@ def matching(values: np.ndarray, least: float, most: float) -> float:
 
 def perpendicular() -> Row:
     """C10: error left along and across the contours after a straight pass over a plane slope, by direction."""
-    from app.tracking.contour_matching import window_fix
-    from app.tracking.map_cells import MapCells
-
     values = np.tile(48.0 + 1.0 * np.arange(121) * 0.1, (121, 1))[..., None]  # 1 uT/m along x
     cells = MapCells((0.0, 0.0), 0.1, values, np.zeros_like(values), np.ones((121, 121), dtype=bool))
     fix = window_fix(cells, np.array([54.0]), np.array([6.1, 6.1]), np.eye(2) * 0.25, 0.0707)

@@ -177,6 +177,12 @@ def test_gma_fed_back_drives_the_filter_astray_and_batches_do_not(cells):
     assert np.sqrt(np.mean(fed[1000:1500] ** 2)) > 2.0 * np.sqrt(np.mean(batches[1000:1500] ** 2))
 
 
+def test_without_a_filter_the_place_overwrites_the_position(cells):
+    _, track = flown(cells, Aiding("gan", "state", always=True, every=4), seconds=1.0)
+    moved = track.state[5, :2] - track.state[4, :2] - track.match_offset_m[4]  # a step without GPS
+    np.testing.assert_allclose(moved, track.state[4, 3:5] * 0.01, atol=1e-9)
+
+
 def test_velocity_helps_in_an_outage(cells):
     """C7 (Cuenca, L1079)."""
     without, _ = flown(cells, Aiding("none"))

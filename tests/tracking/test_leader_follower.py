@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from app.synthetic.convoy import follow, lead
-from app.synthetic.corridor import make_corridor, surveyed_cells
+from app.synthetic.corridor import inside, make_corridor, surveyed_cells
 from app.tracking.cross_track import (
     STORMS_GAINS,
     PidGains,
@@ -235,6 +235,7 @@ def test_followers_come_around_the_corner(convoy):
     assert sum(run.outcome in ("complete", "successful") for run in runs) >= 2
     across = [np.median([abs(cross_track(leader.true_m, p).error_m) for p in run.true_m[::10]]) for run in runs]
     assert np.median(across) < 0.4
+    assert all(inside(run.true_m, 1e-6).all() for run in runs)  # who left was put back
 
 
 def test_followers_do_not_without_the_turn_command(convoy):

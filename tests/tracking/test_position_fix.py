@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.field.grid import FieldGrid
 from app.tracking.grid_posterior import GridPosterior, grid_posterior, local_maxima, log_likelihood, log_prior
 from app.tracking.map_cells import MapCells
 from app.tracking.position_fix import FixSettings, half_width_16_84, lever_arm_agrees, matched_fix, ml_fix
@@ -237,6 +238,22 @@ def test_window_and_bilinear_values():
     fine = cells.resampled(np.array([2.0, 1.5]), np.array([0.1, 0.06]), 0.02)
     np.testing.assert_allclose(fine.mean_uT[3, 5], cells.at(np.array([[2.0, 1.5]]))[0])
     assert fine.mean_uT.shape == (7, 11, 3)
+
+
+def test_a_layer_of_a_served_map():
+    """The cells are the layer's, and values between them those that `FieldGrid.at` gives."""
+    rng = np.random.default_rng(0)
+    mean = rng.normal(size=(2, 5, 6, 3)).astype(np.float32)
+    grid = FieldGrid(
+        "vector", (1.0, -2.0), 0.5, np.array([0.0, 1.5]), mean, np.abs(mean), np.zeros((2, 5, 6, 3, 2), np.float32),
+        rng.random((2, 5, 6)) > 0.2, np.zeros(3), np.ones(3), np.ones(3),
+    )  # fmt: skip
+    cells = MapCells.of_grid(grid, 1)
+    points = rng.uniform([1.0, -2.0], [3.5, 0.0], (40, 2))
+    served = grid.at(np.column_stack([points, np.full(40, 1.5)]))
+    np.testing.assert_array_equal(np.isfinite(cells.at(points)[:, 0]), served.measured)
+    np.testing.assert_allclose(cells.at(points)[served.measured], served.mean_uT[served.measured], atol=1e-6)
+    np.testing.assert_allclose(cells.variance_uT2, np.square(mean[1]), rtol=1e-6)
 
 
 def test_norm_of_a_map():
