@@ -192,7 +192,7 @@ def convoy(
 def astray(rows: list[ConvoyRow]) -> tuple[int, float, float]:
     """Of runs that left: how many, the share whose fix was to blame, and the slope there over the path's median.
 
-    To blame: the estimate was more than 0.3 m off across the path when the vehicle left. The slope is across the path,
+    To blame: the estimate was more than 0.3 m off across the path when the vehicle left. The slope is the field's,
     where the estimate first went that far off.
     """
     blamed, slopes, left = 0, [], 0
