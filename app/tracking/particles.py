@@ -1,4 +1,4 @@
-"""Particles that carry what can be integrated exactly (Rao-Blackwell): the sensor's offset, errors alike along the walk.
+"""Particles that carry what is integrated exactly (Rao-Blackwell): the sensor's offset, errors alike along the walk.
 
 A particle is a pose. Given its path, readings are a linear Gaussian function of an offset b, constant in the sensor's
 axes, and of two processes of unit variance, of correlations exp(-d / l) over the distance walked:
@@ -245,9 +245,9 @@ def effective_sample_size(weight: Array) -> float:
 
 
 def resample(particles: Particles, weight: Array, count: int, draw: float) -> tuple[Particles, NDArray[np.int64]]:
-    """Systematic resampling with one uniform draw (Kuevor, L1565): `count` particles of one weight, which together weigh
+    """Systematic resampling with one uniform draw (Kuevor, L1565): `count` particles of one weight, together as
 
-    what the old ones did; and from which each was drawn.
+    heavy as the old ones; and from which each was drawn.
     """
     edges = np.cumsum(weight)
     chosen = np.searchsorted(edges, (draw + np.arange(count)) / count * edges[-1], side="right")

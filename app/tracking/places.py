@@ -1,7 +1,7 @@
 """The maps of the floors as the filter reads them: features, their variance, and whether anything was measured.
 
 Every floor is one or more planes (its map's heights); all planes lie in one flat array, cell after cell, for the
-compiled loops. Features and scaling are those of the search (`app.positioning.floors`), so that both judge a place alike.
+compiled loops. Features and scaling are those of the search (`app.positioning.floors`): both judge a place alike.
 """
 
 from collections.abc import Sequence
