@@ -62,7 +62,7 @@ def look_up_plain(grid: FieldGrid, points_m: Array) -> Looked:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(points, table, found, measured):  # type: ignore[no-untyped-def]
-    nz, ny, nx, columns = table.record.shape
+    _, ny, nx, columns = table.record.shape
     for k in range(len(points)):
         u = (points[k, 0] - table.x0_m) / table.resolution_m
         v = (points[k, 1] - table.y0_m) / table.resolution_m

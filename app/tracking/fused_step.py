@@ -331,7 +331,8 @@ def step_plain(
     """The same with normals (4, n) and a uniform given; in the precision of the cloud's arrays."""
     told = step.numbers().astype(cloud.state.dtype)
     state, weight = cloud.state, cloud.weight
-    resampled = bool(_effective(weight) < resample_below * len(weight) * _EXACTLY)
+    total = float(weight.sum())
+    resampled = total**2 < resample_below * len(weight) * float(weight @ weight) * _EXACTLY
     if resampled:
         edge = np.cumsum(weight, dtype=np.float64)
         first = np.minimum(np.ceil(edge * (len(weight) / edge[-1]) - draw), len(weight)).astype(np.int64)
@@ -343,11 +344,7 @@ def step_plain(
     diverged = not 0.0 < total < np.inf
     weight = np.full_like(weight, 1.0 / len(weight)) if diverged else weight * weight.dtype.type(1.0 / total)
     moments = _moments_of(_weighted_sums(state, weight))
-    return Stepped(Cloud(state, weight), moments, _effective(weight), resampled, diverged)
-
-
-def _effective(weight: Float32) -> float:
-    return float(weight.sum()) ** 2 / float(weight @ weight)
+    return Stepped(Cloud(state, weight), moments, 1.0 / float(weight @ weight), resampled, diverged)
 
 
 def _moved(state: Float32, noise: NDArray[np.floating], told: Float32) -> Float32:
