@@ -4,7 +4,7 @@ State [pE, pN, vE, vN, aE, aN]: Gauss-Markov acceleration, a soft penalty for be
 either readings of the field, compared with the nearest sample's, or positions from elsewhere.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class MagNavigate:
     road: RoadPenalty
     field_uT: Array
     field_sd_uT: Array
-    motion: GaussMarkov = GaussMarkov()
+    motion: GaussMarkov = field(default_factory=GaussMarkov)
     position_sd_m: float = 10.0
     resample_below: float = ALWAYS
 

@@ -45,7 +45,7 @@ def test_positions_hold_it_where_they_say():
 
 
 def test_nothing_read_only_spreads_along_the_road():
-    navigate, sample_m, _ = road_filter()
+    navigate, _, _ = road_filter()
     rng = np.random.default_rng(3)
     particles = Particles.equal(np.tile([200.0, 0.0, 0.0, 0.0, 0.0, 0.0], (500, 1)))
     for _ in range(20):
