@@ -1,7 +1,7 @@
 """What Kuevor's dissertation found about tracking a drone by the map of a room, tried again in analytic rooms like his.
 
 Four survey flights are fitted with the project's own engine; the steepest and the flattest point of the map, r*_max and
-r*_min, are chosen as he does (B26); eight flights pass through them: hovering, and striding along x, y and z (B28).
+r*_min, are chosen as he does (B26); eight flights pass through them: hovers and strides in x, y, z (B28).
 The filter is his (B27): dead reckoning with a 200 Hz accelerometer, attitude known, a prior around the true start, a
 constant R_mag, the box, resampling below 0.75 n with jitter. It runs with the magnetometer (20 Hz), with an altimeter as
 well (4 Hz), with the field's norm instead of the vector (B31), and with our likelihood, where R is the sensor's and the
@@ -11,7 +11,7 @@ here. Flights have no take-off and landing.
 Noise: accelerometer 1.5 m/s^2 white per sample and a constant 0.05 m/s^2 (1 sd); magnetometer 0.12 uT white and a
 constant 0.25 uT (1 sd) per flight; altimeter 3 cm, while the filter believes his 0.005 m^2.
 
-    python benchmarks/kuevor_tracking.py [--rooms 1] [--repetitions 20] [--seconds 30] [--particles 1000]
+    python benchmarks/kuevor_tracking.py [--rooms 1] [--repetitions 20] [--seconds 20] [--particles 500]
 
 Prints tables and a verdict for each relation; DISAGREES is a finding. Exits 1 when something could not be computed.
 """
@@ -20,6 +20,7 @@ import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -70,7 +71,7 @@ SEEDS = {  # Table 4.6 and 4.7: truncated norm RMSE, m (Kuevor, L1813-L1823, L20
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A flight at its readings: true positions (m, 3), readings (m, 3), heights (m,), and bursts (m, 10, 3) before them."""
+    """True positions (m, 3), readings (m, 3) and heights (m,) at times of readings; bursts (m, 10, 3) lead there."""
 
     point: str
     kind: Kind
@@ -224,7 +225,7 @@ def fitted(room: SyntheticRoom, seed: int, engine: str) -> FieldGrid:
 def by_gradient(gradient: Array, squared_m2: Array) -> str:
     """RMS errors of the readings in each range of the true gradient's norm; his room has 5.6 to 22 uT/m (B26)."""
     edges, cells = (0.0, 1.0, 3.0, 5.6, 10.0, np.inf), []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         inside = (gradient >= low) & (gradient < high)
         if inside.any():
             cells.append(f"{low:g}-{high:g} uT/m {np.sqrt(squared_m2[inside].mean()):.2f} m ({inside.mean():.0%})")
@@ -327,8 +328,8 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--rooms", type=int, nargs="+", default=[1])
     parser.add_argument("--repetitions", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--particles", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--particles", type=int, default=500)
     parser.add_argument("--engine", choices=["hilbert", "compromise", "exact"], default="hilbert")
     asked = parser.parse_args()
     finite = [room_study(seed, asked) for seed in asked.rooms]

@@ -18,6 +18,7 @@ __all__ = ["GRAVITY_M_S2", "Accelerometer", "Displacement", "GaussMarkov", "Rand
 
 GRAVITY_M_S2 = 9.81
 _CANCELS_BELOW = 0.1  # of T / tau: there the closed form of the noise loses digits
+_NODE, _NODE_WEIGHT = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,20 +102,20 @@ class GaussMarkov:
         """States (n, 3 k) after `elapsed_s`, the true time however long; none passes without noise."""
         if elapsed_s <= 0.0:
             return state
-        axes = state.reshape(len(state), 3, -1)
+        axes = state.shape[1] // 3
+        moved = state @ np.kron(self.transition(elapsed_s), np.eye(axes)).T
         root = np.linalg.cholesky(self.noise_covariance(elapsed_s))
-        noise = rng.standard_normal(axes.shape)
-        moved = np.einsum("ij,njk->nik", self.transition(elapsed_s), axes) + np.einsum("ij,njk->nik", root, noise)
+        moved += rng.standard_normal(state.shape) @ np.kron(root, np.eye(axes)).T
         if self.speed_limit_m_s is not None:
-            speed = np.linalg.norm(moved[:, 1], axis=1, keepdims=True)
-            moved[:, 1] *= np.minimum(1.0, self.speed_limit_m_s / np.maximum(speed, 1e-12))
-        return np.asarray(moved.reshape(state.shape))
+            velocity = moved[:, axes : 2 * axes]
+            speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+            velocity *= np.minimum(1.0, self.speed_limit_m_s / np.maximum(speed, 1e-12))
+        return moved
 
     def _integrated(self, elapsed_s: float) -> Array:
-        node, weight = np.polynomial.legendre.leggauss(8)
-        g = _response(0.5 * elapsed_s * (node + 1.0), self.time_constant_s)
+        g = _response(0.5 * elapsed_s * (_NODE + 1.0), self.time_constant_s)
         strength = 2.0 * self.acceleration_sd_m_s2**2 / self.time_constant_s
-        return np.asarray(strength * 0.5 * elapsed_s * (weight * g) @ g.T)
+        return np.asarray(strength * 0.5 * elapsed_s * (_NODE_WEIGHT * g) @ g.T)
 
 
 @dataclass(frozen=True, slots=True)
