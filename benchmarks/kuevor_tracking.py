@@ -1,12 +1,12 @@
 """What Kuevor's dissertation found about tracking a drone by the map of a room, tried again in analytic rooms like his.
 
 Four survey flights are fitted with the project's own engine; the steepest and the flattest point of the map, r*_max and
-r*_min, are chosen as he does (B26); eight flights pass through them: hovers and strides in x, y, z (B28).
+r*_min, are chosen as he does (B26); eight flights hover or stride in x, y, z there (B28).
 The filter is his (B27): dead reckoning with a 200 Hz accelerometer, attitude known, a prior around the true start, a
-constant R_mag, the box, resampling below 0.75 n with jitter. It runs with the magnetometer (20 Hz), with an altimeter as
+constant R_mag, the box, resampling below 0.75 n with jitter. It runs with the magnetometer (20 Hz), an altimeter as
 well (4 Hz), with the field's norm instead of the vector (B31), and with our likelihood, where R is the sensor's and the
-map's variance. All its values that the source does not print were proposed before (specification 5.1) and are not tuned
-here. Flights have no take-off and landing.
+map's variance. Values that the source does not print were proposed before these flights and are not tuned here: 1 uT,
+jitter of 2 cm and 0.05 m/s, a prior of 5 cm and 0.05 m/s. Flights have no take-off and landing.
 
 Noise: accelerometer 1.5 m/s^2 white per sample and a constant 0.05 m/s^2 (1 sd); magnetometer 0.12 uT white and a
 constant 0.25 uT (1 sd) per flight; altimeter 3 cm, while the filter believes his 0.005 m^2.

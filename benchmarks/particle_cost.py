@@ -26,8 +26,10 @@ from scipy.ndimage import gaussian_filter
 from threadpoolctl import threadpool_limits
 
 from app.field.grid import FieldGrid
-from app.tracking.fused_step import CellTable, Cloud, Step, cell_table, step_fused, step_plain
+from app.tracking.cloud import CellTable, Cloud, Step, cell_table
+from app.tracking.fused_step import step_fused
 from app.tracking.motion import Displacement
+from app.tracking.plain_step import step_plain
 
 try:
     import particles
@@ -117,9 +119,12 @@ def of_package(cloud: Cloud, table: CellTable) -> Callable[[], object]:
             u, v = np.clip((x - x0) * per_m, 0, nx - 1), np.clip((y - y0) * per_m, 0, ny - 1)
             i, j = np.minimum(u.astype(np.int64), nx - 2), np.minimum(v.astype(np.int64), ny - 2)
             fu, fv, place = u - i, v - j, j * nx + i
-            a, b = flat.take(place, axis=0).T, flat.take(place + 1, axis=0).T
-            c, d = flat.take(place + nx, axis=0).T, flat.take(place + nx + 1, axis=0).T
-            bx, by, bz, variance = ((1 - fu) * a + fu * b) * (1 - fv) + ((1 - fu) * c + fu * d) * fv
+            shares = ((1 - fu) * (1 - fv), fu * (1 - fv), (1 - fu) * fv, fu * fv)
+            bx, by, bz, variance = found = np.zeros((4, len(u)))
+            for offset, share in zip((0, 1, nx, nx + 1), shares, strict=True):
+                corner = np.ascontiguousarray(flat.take(place + offset, axis=0).T)
+                corner *= share
+                found += corner
             c, s = np.cos(heading), np.sin(heading)
             bx -= c * reading[0] - s * reading[1]
             by -= s * reading[0] + c * reading[1]

@@ -2,11 +2,11 @@
 
 MagNavigate (`app.tracking.magnavigate`) follows a drive on the map of another, updated by readings of the field or by
 positions from ML, MLR or ABL. The filter's values are his: 500 particles, tau 2 s, 5 m/s^2, road 6 m, a start within
-50 m. Roads, vehicles and the settings of MLR and ABL are those of `shockley_orderings.py`. Settled after seeing that the
-filter loses itself on worlds 29 to 31 otherwise, each because of something he describes:
+50 m. Roads, vehicles and the settings of MLR and ABL are those of `shockley_orderings.py`. Settled after seeing that
+the filter loses itself on worlds 29 to 31 otherwise, each time for a reason he describes:
 
-- the sd of a reading is his statistic of these roads (0.68 uT, across vehicles 1.03), times the root of how many samples
-  lie in the length of a feature, for their errors are alike; with his table's sigma the filter starves (a row below);
+- the sd of a reading is his statistic of these roads (0.68 uT, across vehicles 1.03), times the root of how many
+  samples lie in the length of a feature, for their errors are alike; with his table's sigma the filter starves;
 - a step lasts half a second at most, unless a case says that stops run free (Shockley, L1458);
 - the sd of position updates, which he does not give, is the RMS error of such fixes in world 1.
 

@@ -1,4 +1,4 @@
-"""One step of a particle filter in one compiled pass over the particles, beside the same step in plain numpy.
+"""One step of a particle filter in one compiled pass over the particles; `app.tracking.plain_step` is the plain twin.
 
 The common case: particles on one floor moved by `app.tracking.motion.Displacement`, a map of three components with one
 variance per cell, a reading in the teller's level frame, one sensor variance. Single precision and rows of particles
@@ -10,108 +10,23 @@ Particles are resampled at the beginning of the step after the one that made the
 moving them, and between steps the cloud is the weighted one that estimates are made from.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from app.field.grid import FieldGrid
-from app.geometry import Array
-from app.tracking.motion import Displacement
+from app.tracking.cloud import EXACTLY, UNMAPPED_UT2, CellTable, Cloud, Step, Stepped, moments_of
 from app.tracking.particle_filter import RESAMPLE_BELOW
-from app.tracking.random_numbers import BLOCK, Float32, exp_of, fill_normals, log_of, uniform
+from app.tracking.random_numbers import BLOCK, exp_of, fill_normals, log_of, uniform
 
-__all__ = ["CellTable", "Cloud", "Moments", "Step", "Stepped", "cell_table", "step_fused", "step_plain"]
+__all__ = ["step_fused"]
 
-_UNMEASURED_UT2, _UNMAPPED_UT2 = np.float32(1e30), np.float32(1e15)
 _NO_FIT, _UNKNOWN, _LOST = np.float32(-np.inf), np.float32(np.inf), np.float32(-87.0)
-_EXACTLY = 1.0 - 1e-6  # equal weights are as many as they are, whatever rounding says
 _F0, _F1, _F2, _F3, _HALF = (np.float32(v) for v in (0.0, 1.0, 2.0, 3.0, 0.5))
 _U1, _U2, _U3, _FOUR = (np.uint64(v) for v in (1, 2, 3, 4))
 _SIXTH, _TWENTY_FOURTH, _ONE_AND_HALF = np.float32(1.0 / 6.0), np.float32(1.0 / 24.0), np.float32(1.5)
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-_reordered = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_reordered = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 """For sums: the same bits on the same kind of processor."""
-
-
-class CellTable(NamedTuple):
-    """record (ny, nx, 4): bx, by, bz (uT) and their mean variance (uT^2), which is 1e30 where nobody measured."""
-
-    record: Float32
-    x0_m: np.float32
-    y0_m: np.float32
-    cells_per_m: np.float32
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """state (5, n): x, y (m), cos and sin of the heading, scale; weight (n,) with sum one."""
-
-    state: Float32
-    weight: Float32
-
-    @classmethod
-    def of(cls, position_m: Array, heading_rad: Array, scale: Array) -> "Cloud":
-        """Equal weights at positions (n, 2), headings (n,) and scales (n,)."""
-        rows = [*position_m.T, np.cos(heading_rad), np.sin(heading_rad), scale]
-        state = np.ascontiguousarray(rows, dtype=np.float32)
-        return cls(state, np.full(state.shape[1], 1.0 / state.shape[1], dtype=np.float32))
-
-    def __len__(self) -> int:
-        return int(self.state.shape[1])
-
-
-class Step(NamedTuple):
-    """What a step is told: displacement (2,) m and reading (3,) uT in the teller's level frame, and their noise."""
-
-    displacement_m: tuple[float, float]
-    reading_uT: tuple[float, float, float]
-    sensor_variance_uT2: float
-    motion: Displacement
-    elapsed_s: float = 0.0
-
-    def numbers(self) -> Float32:
-        """(10,) dx, dy, sds of position, heading and scale, the reading, the variance."""
-        length_m = float(np.hypot(*self.displacement_m))
-        sds = self.motion.sds(length_m, self.elapsed_s)
-        return np.array([*self.displacement_m, *sds, *self.reading_uT, self.sensor_variance_uT2], dtype=np.float32)
-
-
-class Moments(NamedTuple):
-    """Weighted mean (5,) of the rows of the state, and covariance (2, 2) of x and y, m^2."""
-
-    mean: Array
-    covariance_m2: Array
-
-
-class Stepped(NamedTuple):
-    """The weighted cloud after a step, its moments, its effective sample size, and what happened.
-
-    resampled: before it moved; diverged: all particles had lost, and weigh the same again.
-    """
-
-    cloud: Cloud
-    moments: Moments
-    effective: float
-    resampled: bool
-    diverged: bool
-
-
-def cell_table(grid: FieldGrid, layer: int = 0) -> CellTable:
-    """The table of one layer of a vector map of at least two by two cells."""
-    mean = grid.mean_uT[layer]
-    assert mean.shape[2] == 3, mean.shape
-    assert min(mean.shape[:2]) > 1, mean.shape
-    variance = np.mean(np.square(grid.sd_uT[layer]), axis=2)
-    record = np.concatenate([mean, np.where(grid.measured[layer], variance, _UNMEASURED_UT2)[..., None]], axis=2)
-    x0, y0 = grid.origin_m
-    return CellTable(np.ascontiguousarray(record, np.float32), *map(np.float32, (x0, y0, 1.0 / grid.resolution_m)))
-
-
-# ---- compiled
 
 
 def step_fused(
@@ -123,7 +38,7 @@ def step_fused(
     resampled, diverged, sums = _step(
         cloud.state, cloud.weight, state, weight, table, step.numbers(), *key, resample_below
     )
-    return Stepped(Cloud(state, weight), _moments_of(sums), sums[0] ** 2 / sums[9], resampled, diverged)
+    return Stepped(Cloud(state, weight), moments_of(sums), sums[0] ** 2 / sums[9], resampled, diverged)
 
 
 @_compiled
@@ -136,7 +51,7 @@ def _step(state, weight, new_state, new_weight, table, told, number, seed, resam
     fit = np.empty(BLOCK, dtype=np.float32)
     flat, row = table.record.ravel(), np.uint64(4 * table.record.shape[1])
     total, squares = _total(weight)
-    resampled = total * total < resample_below * n * squares * _EXACTLY
+    resampled = total * total < resample_below * n * squares * EXACTLY
     ancestor = _ancestors(weight, total, uniform(number, seed)) if resampled else np.empty(0, dtype=np.uint32)
     greatest = _NO_FIT
     for first in range(0, n, BLOCK):  # arrays of one block stay in the first cache, and their loops become vectors
@@ -254,7 +169,7 @@ def _fit(here, found, share, fit, told):  # type: ignore[no-untyped-def]
     for k in range(here.shape[1]):  # apart, for this one becomes vectors
         variance = share[1, k]
         known = -_HALF * (share[0, k] / variance + _F3 * log_of(variance))
-        known = known if variance < _UNMAPPED_UT2 else _UNKNOWN
+        known = known if variance < UNMAPPED_UT2 else _UNKNOWN
         fit[k] = known if share[2, k] > _F0 else _UNKNOWN
 
 
@@ -315,95 +230,3 @@ def _sums(moved, weight):  # type: ignore[no-untyped-def]
         s8 += w * y * y
         s9 += w * w
     return np.array([s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, x0, y0])
-
-
-# ---- plain
-
-
-def step_plain(
-    cloud: Cloud,
-    table: CellTable,
-    step: Step,
-    noise: NDArray[np.floating],
-    draw: float,
-    resample_below: float = RESAMPLE_BELOW,
-) -> Stepped:
-    """The same with normals (4, n) and a uniform given; in the precision of the cloud's arrays."""
-    told = step.numbers().astype(cloud.state.dtype)
-    state, weight = cloud.state, cloud.weight
-    total = float(weight.sum())
-    resampled = total**2 < resample_below * len(weight) * float(weight @ weight) * _EXACTLY
-    if resampled:
-        edge = np.cumsum(weight, dtype=np.float64)
-        first = np.minimum(np.ceil(edge * (len(weight) / edge[-1]) - draw), len(weight)).astype(np.int64)
-        state = state.take(np.repeat(np.arange(len(weight)), np.diff(first, prepend=0)), axis=1)
-        weight = np.full_like(weight, 1.0 / len(weight))
-    state = _moved(state, noise, told)
-    weight = _weighed(weight, *_fitted(state, table, told))
-    total = float(weight.sum(dtype=np.float64))
-    diverged = not 0.0 < total < np.inf
-    weight = np.full_like(weight, 1.0 / len(weight)) if diverged else weight * weight.dtype.type(1.0 / total)
-    moments = _moments_of(_weighted_sums(state, weight))
-    return Stepped(Cloud(state, weight), moments, 1.0 / float(weight @ weight), resampled, diverged)
-
-
-def _moved(state: Float32, noise: NDArray[np.floating], told: Float32) -> Float32:
-    x, y, c, s, scale = state
-    dx, dy, position_sd, heading_sd, scale_sd = told[:5]
-    turn = heading_sd * noise[2]
-    sine, cosine = np.sin(turn), np.cos(turn)
-    c, s = c * cosine - s * sine, s * cosine + c * sine
-    scale = scale + scale_sd * noise[3]
-    moved = np.empty_like(state)
-    moved[0] = x + scale * (c * dx - s * dy) + position_sd * noise[0]
-    moved[1] = y + scale * (s * dx + c * dy) + position_sd * noise[1]
-    moved[2], moved[3], moved[4] = c, s, scale
-    return moved
-
-
-def _fitted(moved: Float32, table: CellTable, told: Float32) -> tuple[Float32, NDArray[np.bool_]]:
-    bx, by, bz, sensor = told[5:]
-    record = table.record
-    ny, nx, _ = record.shape
-    u, v = (moved[0] - table.x0_m) * table.cells_per_m, (moved[1] - table.y0_m) * table.cells_per_m
-    inside = (u >= 0) & (u <= nx - 1) & (v >= 0) & (v <= ny - 1)
-    u, v = np.clip(u, 0, nx - 1), np.clip(v, 0, ny - 1)
-    i, j = np.minimum(u.astype(np.int32), nx - 2), np.minimum(v.astype(np.int32), ny - 2)
-    fu, fv = u - i.astype(u.dtype), v - j.astype(v.dtype)
-    place, flat = j * nx + i, record.reshape(-1, 4)
-    low = flat.take(place, axis=0).T, flat.take(place + 1, axis=0).T
-    high = flat.take(place + nx, axis=0).T, flat.take(place + nx + 1, axis=0).T
-    left, right = (1 - fu), fu
-    x, y, z, variance = (left * low[0] + right * low[1]) * (1 - fv) + (left * high[0] + right * high[1]) * fv
-    mapped = inside & (variance < _UNMAPPED_UT2)
-    x -= moved[2] * bx - moved[3] * by
-    y -= moved[3] * bx + moved[2] * by
-    z -= bz
-    variance += sensor
-    return -0.5 * ((x * x + y * y + z * z) / variance + 3.0 * np.log(variance)), mapped
-
-
-def _weighed(weight: Float32, fit: Float32, mapped: NDArray[np.bool_]) -> Float32:
-    told = mapped & (weight > 0)
-    if not told.any():
-        return weight.copy()
-    likely = np.exp(np.minimum(fit - fit.max(where=told, initial=-np.inf), 0.0))
-    if told.all():
-        return np.asarray(weight * likely)
-    mean = float(np.sum((weight * likely)[told], dtype=np.float64) / np.sum(weight[told], dtype=np.float64))
-    return np.asarray(weight * np.where(mapped, likely, weight.dtype.type(mean)))
-
-
-def _weighted_sums(moved: Float32, weight: Float32) -> Array:
-    x, y = moved[0] - moved[0, 0], moved[1] - moved[1, 0]
-    wx, wy = weight * x, weight * y
-    rows = [weight.sum(), wx.sum(), wy.sum(), *(moved[2:] @ weight), wx @ x, wx @ y, wy @ y, weight @ weight]
-    return np.array([*rows, moved[0, 0], moved[1, 0]], dtype=np.float64)
-
-
-def _moments_of(sums: Array) -> Moments:
-    """Of the sums about the first particle, which are last."""
-    mean = sums[1:6] / sums[0]
-    xx, xy, yy = sums[6:9] / sums[0] - mean[[0, 0, 1]] * mean[[0, 1, 1]]
-    mean[:2] += sums[10:]
-    return Moments(mean, np.array([[xx, xy], [xy, yy]]))

@@ -1,8 +1,9 @@
-"""Random numbers by counting: the same seed, step and particle give the same bits, in any order (Salmon et al. 2011).
+"""Random numbers by counting: seed, step and particle give the same bits in any order (Salmon et al. 2011).
 
 Philox 4x32 turns a counter of four words and a key of two into four random words; two pairs make four normals by
 Box and Muller. No state is carried, so a loop over particles has no chain from one to the next, and compilers make it
-vectors. Logarithm, sine and cosine are polynomials for the same reason; normals reach 6.6 sd.
+vectors. Logarithm, sine and cosine are polynomials for the same reason; normals reach 6.6 sd. Words are the same
+everywhere; normals may differ in the last bit between kinds of processors, for products are added without rounding.
 """
 
 import math
@@ -45,7 +46,7 @@ _C = tuple(np.float32(v) for v in (2.443315711809948e-5, -1.388731625493765e-3, 
 """Sine and cosine within an eighth of a turn (Moshier, Cephes, sinf and cosf)."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def philox(words, k0, k1, rounds):  # type: ignore[no-untyped-def]
     """Turn counters (4, k) of uint32 into as many random words, in place, with a key of two words in uint64."""
     for _ in range(rounds):  # round by round over all counters: this loop becomes vectors
@@ -57,7 +58,7 @@ def philox(words, k0, k1, rounds):  # type: ignore[no-untyped-def]
         k0, k1 = (k0 + _W0) & _LOW, (k1 + _W1) & _LOW
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def log_of(v):  # type: ignore[no-untyped-def]
     """Natural logarithm of a positive normal float32, to about an ulp."""
     bits = np.float32(v).view(np.int32)
@@ -78,7 +79,7 @@ def log_of(v):  # type: ignore[no-untyped-def]
     return x + (y * x * z - _HALF_F * z) + exponent * _LN2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def exp_of(v):  # type: ignore[no-untyped-def]
     """Exponential of a float32 not above zero, to about an ulp; below -87 it is that of -87, 1.6e-38."""
     v = max(np.float32(v), _LEAST)
@@ -93,7 +94,7 @@ def exp_of(v):  # type: ignore[no-untyped-def]
     return y * np.float32(np.int32((np.int32(power) + np.int32(127)) << _SHIFT).view(np.float32))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _pair(a, b):  # type: ignore[no-untyped-def]
     """Two normals of two words: a radius of 31 bits, a quadrant of two bits and an angle within it of 30."""
     u = (np.float32(np.int32(np.uint64(a) >> _ONE)) + _HALF_F) * _TO_UNIT
@@ -108,7 +109,7 @@ def _pair(a, b):  # type: ignore[no-untyped-def]
     return radius * (s if swapped else c), radius * (c if swapped else -s)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def fill_normals(out, words, first, step, seed):  # type: ignore[no-untyped-def]
     """Fill out (4, k) with the normals of k particles from `first` on; words (4, k) is scratch. Both contiguous."""
     for i in range(words.shape[1]):
@@ -120,7 +121,7 @@ def fill_normals(out, words, first, step, seed):  # type: ignore[no-untyped-def]
         out[2, i], out[3, i] = _pair(words[2, i], words[3, i])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def uniform(step, seed):  # type: ignore[no-untyped-def]
     """The one uniform of a step, in [0, 1); step and seed in uint64."""
     words = np.zeros((4, 1), dtype=np.uint32)

@@ -5,11 +5,13 @@ import pytest
 from scipy.stats import kstest
 
 from app.field.grid import FieldGrid
+from app.tracking.cloud import Cloud, Step, cell_table
 from app.tracking.field_likelihood import log_likelihood, neutral, turned
 from app.tracking.field_lookup import look_up_plain
-from app.tracking.fused_step import Cloud, Step, cell_table, step_fused, step_plain
+from app.tracking.fused_step import step_fused
 from app.tracking.motion import Displacement
 from app.tracking.particle_filter import normalise
+from app.tracking.plain_step import step_plain
 from app.tracking.random_numbers import BLOCK, exp_of, log_of, normals, philox, uniform
 
 STEP = Step((0.4, 0.1), (18.0, 2.0, -44.0), 0.5, Displacement(0.1, 0.05, 0.01))
