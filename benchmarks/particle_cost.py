@@ -19,7 +19,7 @@ Exits 1 when the fused step is not five times as fast as each of the others.
 import argparse
 import sys
 from collections.abc import Callable
-from time import perf_counter
+from time import thread_time
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -162,16 +162,16 @@ def of_package(cloud: Cloud, table: CellTable) -> Callable[[], object]:
 
 
 def timed(steps: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
-    """Seconds (rounds, IN_A_ROW) of each, a few steps in a row, in turns so that a busy machine is busy for all."""
+    """Processor time (rounds, IN_A_ROW) of each, s: steps in a row, in turns, as a busy machine is busy for all then."""
     for step in steps.values():
         step()
     seconds = {name: np.empty((rounds, IN_A_ROW)) for name in steps}
     for k in range(rounds):
         for name, step in steps.items():
             for m in range(IN_A_ROW):
-                started = perf_counter()
+                started = thread_time()
                 step()
-                seconds[name][k, m] = perf_counter() - started
+                seconds[name][k, m] = thread_time() - started
     return seconds
 
 

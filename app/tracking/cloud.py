@@ -96,7 +96,7 @@ def cell_table(grid: FieldGrid, layer: int = 0) -> CellTable:
 
 
 def moments_of(sums: Array) -> Moments:
-    """Of sums (12,) of w, w times each row, w x x, w x y, w y y, w w; x and y about the first particle, which are last."""
+    """Of sums (12,) of w, w times each row, w x x, w x y, w y y, w w, all about the first particle, and its x and y."""
     mean = sums[1:6] / sums[0]
     xx, xy, yy = sums[6:9] / sums[0] - mean[[0, 0, 1]] * mean[[0, 1, 1]]
     mean[:2] += sums[10:]
