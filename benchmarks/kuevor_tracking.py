@@ -12,6 +12,7 @@ Noise: accelerometer 1.5 m/s^2 white per sample and a constant 0.05 m/s^2 (1 sd)
 constant 0.25 uT (1 sd) per flight; altimeter 3 cm, while the filter believes his 0.005 m^2.
 
     python benchmarks/kuevor_tracking.py [--rooms 1] [--repetitions 20] [--seconds 20] [--particles 500]
+                                          [--engine hilbert|compromise|exact|truth] [--offset 0.25]
 
 Prints tables and a verdict for each relation; DISAGREES is a finding. Exits 1 when something could not be computed.
 """
@@ -116,17 +117,19 @@ def path_m(centre: Array, kind: Kind, t_s: Array, rng: np.random.Generator) -> A
     return path
 
 
-def fly_through(room: SyntheticRoom, point: str, centre: Array, kind: Kind, seconds: float, seed: int) -> Flight:
+def fly_through(
+    room: SyntheticRoom, point: str, centre: Array, kind: Kind, asked: argparse.Namespace, seed: int
+) -> Flight:
     """The log of a flight; accelerations are those whose semi-implicit sums give the path."""
     rng = np.random.default_rng(seed)
-    readings = int(seconds / STEP_S) // BURST
+    readings = int(asked.seconds / STEP_S) // BURST
     t_s = STEP_S * np.arange(readings * BURST + 2)
     path = path_m(centre, kind, t_s, rng)
     velocity = np.diff(path, axis=0) / STEP_S
     acceleration = np.diff(velocity, axis=0) / STEP_S
     measured = acceleration + WHITE_M_S2 * rng.normal(size=acceleration.shape) + BIAS_M_S2 * rng.normal(size=3)
     true = path[1 + BURST :: BURST]
-    field = room.field_uT(true) + OFFSET_UT * rng.normal(size=3) + NOISE_UT * rng.normal(size=true.shape)
+    field = room.field_uT(true) + asked.offset * rng.normal(size=3) + NOISE_UT * rng.normal(size=true.shape)
     height = true[:, 2] + ALTIMETER_M * rng.normal(size=len(true))
     return Flight(point, kind, true, velocity[0], field, height, measured.reshape(readings, BURST, 3))
 
@@ -205,7 +208,32 @@ def attributions(grid: FieldGrid, flight: Flight, each: Run, seconds: float = 5.
     return found
 
 
+def true_map(room: SyntheticRoom) -> FieldGrid:
+    """The room's own field on the same cells: what a perfect survey would give."""
+    x_m, y_m = np.arange(-2.8, 2.85, 0.1), np.arange(-2.3, 2.35, 0.1)
+    z, y, x = np.meshgrid(HEIGHTS_M, y_m, x_m, indexing="ij")
+    cells = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    slopes = [(room.field_uT(cells + step) - room.field_uT(cells - step)) / 2e-3 for step in 1e-3 * np.eye(3)]
+    mean = room.field_uT(cells).reshape(*x.shape, 3).astype(np.float32)
+    return FieldGrid(
+        components="vector",
+        origin_m=(-2.8, -2.3),
+        resolution_m=0.1,
+        heights_m=np.array(HEIGHTS_M),
+        mean_uT=mean,
+        sd_uT=np.full_like(mean, 0.02),
+        gradient_uT_per_m=np.stack(slopes, axis=-1).reshape(*mean.shape, 3).astype(np.float32),
+        measured=np.ones(x.shape, dtype=np.bool_),
+        ambient_uT=mean.mean(axis=(0, 1, 2)).astype(np.float64),
+        prior_sd_uT=np.full(3, 5.0),
+        noise_sd_uT=np.full(3, NOISE_UT),
+    )
+
+
 def fitted(room: SyntheticRoom, seed: int, engine: str) -> FieldGrid:
+    """A map of four survey flights, or the truth."""
+    if engine == "truth":
+        return true_map(room)
     rng = np.random.default_rng(seed)
     walks = {
         f"{k}": fly(room, altitudes, rng, noise_uT=NOISE_UT, offset_sd_uT=OFFSET_UT)
@@ -287,8 +315,10 @@ def room_study(seed: int, asked: argparse.Namespace) -> bool:
     room = make_room(np.random.default_rng(seed))
     grid = fitted(room, seed, asked.engine)
     lookup, points = field_table(grid), centres(grid)
+    blind = {name: np.linalg.svd(grid.at(p).gradient_uT_per_m[0])[1][-1] for name, p in points.items()}
     places = ", ".join(
-        f"r*_{name} {np.round(p, 2)} {gradient_norms(grid.at(p).gradient_uT_per_m).total[0]:.2f} uT/m"
+        f"r*_{name} {np.round(p, 2)} {gradient_norms(grid.at(p).gradient_uT_per_m).total[0]:.2f} uT/m, "
+        f"{blind[name]:.2f} in the blindest direction"
         for name, p in points.items()
     )
     print(f"\nroom {seed}: {places}")
@@ -297,7 +327,7 @@ def room_study(seed: int, asked: argparse.Namespace) -> bool:
     table, glms, why, steep, missed = {}, {}, Counter(), [], []
     for kind in KINDS:
         for point, centre in points.items():
-            flight = fly_through(room, point, centre, kind, asked.seconds, 1000 * seed + KINDS.index(kind))
+            flight = fly_through(room, point, centre, kind, asked, 1000 * seed + KINDS.index(kind))
             glms[point, kind] = glm_of(grid, flight)
             cells = []
             for setting in SETTINGS:
@@ -330,7 +360,8 @@ def main() -> int:
     parser.add_argument("--repetitions", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--particles", type=int, default=500)
-    parser.add_argument("--engine", choices=["hilbert", "compromise", "exact"], default="hilbert")
+    parser.add_argument("--offset", type=float, default=OFFSET_UT, help="of the flights that are tracked, uT")
+    parser.add_argument("--engine", choices=["hilbert", "compromise", "exact", "truth"], default="hilbert")
     asked = parser.parse_args()
     finite = [room_study(seed, asked) for seed in asked.rooms]
     return 0 if all(finite) else 1

@@ -162,7 +162,7 @@ def of_package(cloud: Cloud, table: CellTable) -> Callable[[], object]:
 
 
 def timed(steps: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
-    """Processor time (rounds, IN_A_ROW) of each, s: steps in a row, in turns, as a busy machine is busy for all then."""
+    """Processor time (rounds, IN_A_ROW) of each, s: steps in a row, in turns: a busy machine is then busy for all."""
     for step in steps.values():
         step()
     seconds = {name: np.empty((rounds, IN_A_ROW)) for name in steps}
