@@ -130,7 +130,7 @@ def _advance(  # type: ignore[no-untyped-def]
         variance, measured = _look_up(x, y, row[Z], floor[i], cells, planes, shapes, floors, resolution, c, mean)
         row[MEASURED] = forget * row[MEASURED] + (1.0 - forget) * measured
         sigma = np.sqrt(errors[0] * variance)
-        spread = errors[3] * np.sqrt(1.0 - measured)
+        spread = errors[3] * np.sqrt(max(1.0 - measured, 0.0))
         white = errors[1] * variance + noise_uT2
         bb, bv, bf = row[_BB], fade_v * row[_BV], fade_f * row[_BF]
         vv, vf = fade_v * fade_v * row[_VV] + 1.0 - fade_v * fade_v, fade_v * fade_f * row[_VF]

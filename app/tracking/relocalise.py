@@ -54,7 +54,8 @@ def _taken(tracker: Tracker, state: TrackState, found: Found, rng: np.random.Gen
         Node(reading.number, reading.t_s, path_m)
         for reading, path_m in zip(state.recent.readings, state.recent.path_m, strict=True)
     )
-    return replace(state, particles=particles, lag=along(nodes, found.history_m[:, chosen], particles))
+    lag = along(nodes, found.history_m[:, chosen], particles)
+    return replace(state, particles=particles, lag=lag, gains=((state.path_m, found.log_ratio),))
 
 
 def doubtful(tracker: Tracker, state: TrackState) -> bool:

@@ -228,6 +228,7 @@ def replaced_floor() -> Places:
         empty = np.zeros(0)
         _floors.append(Places(
             "vector", np.ones(3), np.zeros(5, dtype=np.float32), np.zeros((1, 3)), np.array([[0, 1, 1]]),
-            np.array([[0, 1]]), np.ones(1), np.ones(1), np.ones(1), np.ones(1), np.ones(5), empty, empty, 1.0, STRUCTURE,
+            np.array([[0, 1]]), np.ones(1), np.ones(1), np.ones(1), np.ones(1), np.ones(5), empty, empty, 1.0,
+            STRUCTURE,
         ))  # fmt: skip
     return _floors[0]
