@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.geometry import Array, wrap_angle_rad
-from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Particles, Z, effective_sample_size
+from app.tracking.particle_filter import effective_sample_size
+from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Particles, Z
 
-__all__ = ["Estimate", "Spot", "State", "carried_on", "describe", "kld_sample_size", "occupied_bins"]
+__all__ = ["Estimate", "Spot", "State", "carried_on", "describe", "occupied_bins"]
 
 State = Literal["searching", "converged", "lost"]
 
@@ -17,8 +18,6 @@ _MODE_M = 3.0  # particles this near a mode's mean are its own
 _MODES = 5
 _LEAST_MODE = 0.02
 _BIN_M, _BIN_RAD = 0.5, np.pi / 12
-KLD_ERROR, KLD_QUANTILE = 0.05, 2.326
-"""Kullback-Leibler distance from the true posterior that the sample may have, with 99 % probability (Fox 2003)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,11 +150,3 @@ def occupied_bins(particles: Particles) -> int:
     place = _keys(particles, _BIN_M)
     heading = np.floor(np.mod(particles.rows[:, HEADING], 2.0 * np.pi) / _BIN_RAD).astype(np.int64)
     return len(np.unique(place * 32 + heading))
-
-
-def kld_sample_size(bins: int, error: float = KLD_ERROR, quantile: float = KLD_QUANTILE) -> float:
-    """Particles that hold the Kullback-Leibler distance below `error`, for a belief over so many bins (Fox 2003)."""
-    if bins <= 1:
-        return 1.0
-    k = bins - 1.0
-    return float(k / (2.0 * error) * (1.0 - 2.0 / (9.0 * k) + np.sqrt(2.0 / (9.0 * k)) * quantile) ** 3)

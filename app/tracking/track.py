@@ -25,12 +25,12 @@ from app.tracking.ground import barriers_of
 from app.tracking.moves import move_between, offset_variance_uT2
 from app.tracking.no_map import predict_without_map, without_map
 from app.tracking.options import StartPrior, TrackOptions
+from app.tracking.particle_filter import needs_resampling
 from app.tracking.particles import (
     DRAWS,
     Advance,
     Particles,
     advance,
-    effective_sample_size,
     log_evidence,
     resample,
     weights,
@@ -47,8 +47,8 @@ from app.tracking.track_state import MOST_ODDS, Tracker, TrackState
 
 __all__ = ["Followed", "TrackState", "Tracker", "begin", "follow", "make_tracker"]
 
+MAPPED = 0.5  # of the last metres, for a claim
 STOREY_M = 1.5  # risen or sunk: another floor
-RESAMPLE_BELOW = 0.75  # of the particles (Kuevor, L1565)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +169,7 @@ def _weigh(
     lag = remember(state.lag, Node(reading.number, reading.t_s, state.path_m), particles)
     weight = weights(particles)
     lag, settled = settle(lag, weight, state.path_m - options.lag_m)
-    if effective_sample_size(weight) < RESAMPLE_BELOW * len(particles):
+    if needs_resampling(weight):
         count = enough(particles, weight, options)
         particles, chosen = resample(particles, weight, count, float(rng.uniform()))
         lag = inherit(lag, chosen)
@@ -200,7 +200,8 @@ def _judged(tracker: Tracker, state: TrackState) -> TrackState:
     sure = state.probability * estimate.concentration
     own_radius_m = float(np.sqrt(max(estimate.radius_95_m**2 - (2.45 * structure.position_sd_m) ** 2, 0.0)))
     state = replace(state, estimate=estimate)
-    if sure >= options.converged_probability and own_radius_m <= options.converged_radius_m:
+    mapped = estimate.measured >= MAPPED
+    if sure >= options.converged_probability and own_radius_m <= options.converged_radius_m and mapped:
         at_m = state.path_m if state.converged_at_m is None else state.converged_at_m
         return replace(state, state="converged", converged_at_m=at_m)
     if (

@@ -14,6 +14,7 @@ from app.geometry import yaw_matrix
 from app.positioning.floors import SearchableFloor
 from app.positioning.window_error import weigh_residuals, window_error
 from app.tracking.ground import barriers_of
+from app.tracking.particle_filter import effective_sample_size
 from app.tracking.particles import (
     DRAWS,
     HEADING,
@@ -22,7 +23,6 @@ from app.tracking.particles import (
     Advance,
     Particles,
     advance,
-    effective_sample_size,
     log_evidence,
     new_particles,
     resample,

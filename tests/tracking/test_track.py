@@ -209,7 +209,8 @@ def test_a_reckoned_height_changes_the_floor_and_stairs_do_where_there_is_none(
         ]
         after = [
             replace(
-                each, t_s=each.t_s + last.t_s + 11, displacement_m=last.displacement_m + gap + up + R @ each.displacement_m,
+                each, t_s=each.t_s + last.t_s + 11,
+                displacement_m=last.displacement_m + gap + up + R @ each.displacement_m,
                 B_uT=R @ each.B_uT, yaw_rad=each.yaw_rad + turn,
             )
             for each in above.steps
@@ -268,9 +269,10 @@ def test_steps_out_of_order_and_frames_no_map_answers_are_refused(
             follow(tracker, state, wrong)
     with pytest.raises(InvalidInput, match="none of the floors"):
         make_tracker([], "level", FEW, 1)
+    ground = grids["ground"]
     norms = replace(
-        grids["ground"], components="norm", mean_uT=grids["ground"].mean_uT[..., :1], sd_uT=grids["ground"].sd_uT[..., :1],
-        gradient_uT_per_m=grids["ground"].gradient_uT_per_m[..., :1, :], ambient_uT=np.ones(1), prior_sd_uT=np.ones(1),
+        ground, components="norm", mean_uT=ground.mean_uT[..., :1], sd_uT=ground.sd_uT[..., :1],
+        gradient_uT_per_m=ground.gradient_uT_per_m[..., :1, :], ambient_uT=np.ones(1), prior_sd_uT=np.ones(1),
         noise_sd_uT=np.ones(1),
     )  # fmt: skip
     with pytest.raises(IncompatibleFrames):
