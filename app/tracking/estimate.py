@@ -65,9 +65,10 @@ def describe(particles: Particles, weight: Array, floors: int, map_variance_m2: 
     """The estimate of particles of normalised weights; `map_variance_m2` per axis is what places of the map err by."""
     spots = _spots(particles, weight)
     best = spots[0]
-    here = particles.floor == best.floor
-    w = weight[here] / weight[here].sum()
-    rows = particles.rows[here]
+    rows, w = particles.rows, weight
+    if len(spots) > 1 or best.probability < 1.0:
+        here = particles.floor == best.floor
+        rows, w = rows[here], weight[here] / weight[here].sum()
     off = rows[:, :2] - np.array(best.position_m[:2])
     covariance = (w[:, None] * off).T @ off + map_variance_m2 * np.eye(2)
     distance = np.hypot(off[:, 0], off[:, 1])
@@ -115,7 +116,10 @@ def carried_on(estimate: Estimate, moved_m: Array) -> Estimate:
 
 
 def _spots(particles: Particles, weight: Array) -> list[Spot]:
-    """Greedily: the heaviest square metre, then what lies within reach of its mean."""
+    """Greedily: the heaviest square metre, then what lies within reach of its mean. One place alone is seen at once."""
+    alone = _one_spot(particles, weight)
+    if alone is not None:
+        return [alone]
     left = weight.copy()
     key = _keys(particles, 2.0 * _BIN_M)
     spots: list[Spot] = []
@@ -135,6 +139,19 @@ def _spots(particles: Particles, weight: Array) -> list[Spot]:
             spots.append(Spot(floor, (float(centre[0]), float(centre[1]), z), heading, float(w.sum())))
         left[near] = 0.0
     return sorted(spots, key=lambda spot: -spot.probability)
+
+
+def _one_spot(particles: Particles, weight: Array) -> Spot | None:
+    """All there is, where it is near its mean on one floor."""
+    floor = int(particles.floor[0])
+    if (particles.floor != floor).any():
+        return None
+    centre = weight @ particles.rows[:, :3]
+    off = particles.rows[:, :2] - centre[:2]
+    if float(np.max(off[:, 0] ** 2 + off[:, 1] ** 2)) > _MODE_M**2:
+        return None
+    heading = float(np.angle(weight @ np.exp(1j * particles.rows[:, HEADING])))
+    return Spot(floor, (float(centre[0]), float(centre[1]), float(centre[2])), heading, 1.0)
 
 
 def _keys(particles: Particles, bin_m: float) -> NDArray[np.int64]:

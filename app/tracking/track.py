@@ -19,21 +19,19 @@ from app.errors import Fault, InvalidInput
 from app.positioning.features import common_components
 from app.positioning.floors import SearchableFloor, reduce_floor, shared_noise_sd_uT
 from app.positioning.window import WindowFrame
-from app.tracking.estimate import Estimate, carried_on, describe
+from app.tracking.estimate import Estimate, carried_on
 from app.tracking.gather import gathered, moved_on
 from app.tracking.ground import barriers_of
 from app.tracking.moves import move_between, offset_variance_uT2
 from app.tracking.no_map import predict_without_map, without_map
 from app.tracking.options import StartPrior, TrackOptions
-from app.tracking.particle_filter import needs_resampling
+from app.tracking.particle_filter import needs_resampling, normalise
 from app.tracking.particles import (
     DRAWS,
     Advance,
     Particles,
     advance,
-    log_evidence,
     resample,
-    weights,
 )
 from app.tracking.places import make_places
 from app.tracking.recent import Reading, Recent
@@ -159,21 +157,21 @@ def _weigh(
     options = tracker.options
     move = move_between(before, reading, tracker.frame, tracker.places, options)
     noise = rng.standard_normal((len(state.particles), DRAWS), dtype=np.float32)
-    evidence = log_evidence(state.particles)
     particles = advance(state.particles, move, tracker.places, tracker.barriers, noise)
-    gained = log_evidence(particles) - evidence
+    weight, gained, _ = normalise(particles.log_weight)
+    particles = replace(particles, log_weight=particles.log_weight - gained)
     particles = _on_floors(tracker, state, particles, before, reading, move, rng)
     walked, lost = state.gains[-1]
     gains = (*state.gains[:-1], (walked, lost + gained))
     log_odds = min(state.log_odds + lost + gained, MOST_ODDS)
     lag = remember(state.lag, Node(reading.number, reading.t_s, state.path_m), particles)
-    weight = weights(particles)
     lag, settled = settle(lag, weight, state.path_m - options.lag_m)
+    estimate = tracker.describe(particles, weight)
     if needs_resampling(weight):
         count = enough(particles, weight, options)
         particles, chosen = resample(particles, weight, count, float(rng.uniform()))
         lag = inherit(lag, chosen)
-    return replace(state, particles=particles, lag=lag, gains=gains, log_odds=log_odds), settled
+    return replace(state, particles=particles, lag=lag, gains=gains, log_odds=log_odds, estimate=estimate), settled
 
 
 def _on_floors(
@@ -192,22 +190,16 @@ def _on_floors(
 
 def _judged(tracker: Tracker, state: TrackState) -> TrackState:
     """The belief in words."""
-    if state.particles is None:
+    options, estimate = tracker.options, state.estimate
+    if state.particles is None or estimate is None:
         return state
-    options, structure = tracker.options, tracker.places.structure
-    weight = weights(state.particles)
-    estimate = describe(state.particles, weight, tracker.places.count, structure.position_sd_m**2)
     sure = state.probability * estimate.concentration
-    own_radius_m = float(np.sqrt(max(estimate.radius_95_m**2 - (2.45 * structure.position_sd_m) ** 2, 0.0)))
-    state = replace(state, estimate=estimate)
+    map_m = 2.45 * tracker.places.structure.position_sd_m  # what the radius owes to the map's own places
+    radius_m = float(np.sqrt(max(estimate.radius_95_m**2 - map_m**2, 0.0)))
     mapped = estimate.measured >= MAPPED
-    if sure >= options.converged_probability and own_radius_m <= options.converged_radius_m and mapped:
+    if sure >= options.converged_probability and radius_m <= options.converged_radius_m and mapped:
         at_m = state.path_m if state.converged_at_m is None else state.converged_at_m
         return replace(state, state="converged", converged_at_m=at_m)
-    if (
-        state.state == "converged"
-        and sure >= options.lost_probability
-        and own_radius_m <= 2 * options.converged_radius_m
-    ):
+    if state.state == "converged" and sure >= options.lost_probability and radius_m <= 2.0 * options.converged_radius_m:
         return state
     return replace(state, state="searching" if state.converged_at_m is None else "lost")

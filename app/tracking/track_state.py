@@ -8,7 +8,7 @@ from scipy.special import expit
 from app.geometry import Array
 from app.positioning.floors import SearchableFloor
 from app.positioning.window import WindowFrame
-from app.tracking.estimate import Estimate, State
+from app.tracking.estimate import Estimate, State, describe
 from app.tracking.ground import Barriers
 from app.tracking.no_map import NoMap
 from app.tracking.options import StartPrior, TrackOptions
@@ -39,6 +39,10 @@ class Tracker:
     def spacing_m(self) -> float:
         """Of readings: nearer ones meet the same cell of the map."""
         return max(self.options.update_m, float(self.places.resolution_m.min()))
+
+    def describe(self, particles: Particles, weight: Array) -> Estimate:
+        """The estimate of particles of normalised weights."""
+        return describe(particles, weight, self.places.count, self.places.structure.position_sd_m**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
