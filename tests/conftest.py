@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import pytest
+from hypothesis import settings
 from sqlalchemy import Engine, create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
@@ -21,6 +22,9 @@ from app.db.engine import create_database_engine, migrate, session_factory
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
+
+settings.register_profile("untimed", deadline=None)  # how fast a machine is, is no test's business
+settings.load_profile("untimed")
 
 CHROMIUM = Path("/usr/bin/chromium")
 POSTGRES_URL = os.environ.get("ISODYN_TEST_POSTGRES_URL", "postgresql+psycopg://root@127.0.0.1:5432/postgres")
