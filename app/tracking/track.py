@@ -38,7 +38,7 @@ from app.tracking.recent import Reading, Recent
 from app.tracking.relocalise import doubtful, search, search_again
 from app.tracking.resampling import enough
 from app.tracking.smoother import Node, Smoothed, empty_lag, inherit, remember, settle
-from app.tracking.start import spread
+from app.tracking.start import spread, walkable_cells
 from app.tracking.step import Step
 from app.tracking.storeys import settle_heights, through_connectors
 from app.tracking.track_state import MOST_ODDS, Tracker, TrackState
@@ -68,7 +68,8 @@ def make_tracker(
     seed: int,
     prior: StartPrior | None = None,
 ) -> Tracker:
-    """Raises InvalidInput without floors, IncompatibleFrames where a map cannot answer the frame."""
+    """Raises InvalidInput without floors or where no cell of theirs can be walked on, IncompatibleFrames where a map
+    cannot answer the frame."""
     if not floors:
         reason = "none of the floors has a map to be followed on; upload surveys and build one"
         raise InvalidInput(reason, Fault("/floor_ids", reason))
@@ -76,9 +77,24 @@ def make_tracker(
     noise_sd_uT = shared_noise_sd_uT([floor.grid for floor in floors])
     ready = tuple(reduce_floor(floor, shared, noise_sd_uT) for floor in floors)
     walls = {} if options.ground is None else options.ground.walls
+    _check_walkable(ready, options)
     return Tracker(
         ready, make_places(ready), barriers_of(walls, [floor.floor_id for floor in ready]), frame, options, seed, prior
     )
+
+
+def _check_walkable(floors: Sequence[SearchableFloor], options: TrackOptions) -> None:
+    walkable = walkable_cells(options.ground)
+    if walkable is None:
+        return
+    for floor in floors:
+        for plane in floor.planes:
+            ny, nx = plane.shape
+            x, y = (np.asarray(plane.origin_m[k] + plane.resolution_m * np.arange(n)) for k, n in ((0, nx), (1, ny)))
+            if walkable(floor.floor_id, x, y).any():
+                return
+    reason = "no cell of the maps lies in the walkable area: check its coordinates, metres in the building frame"
+    raise InvalidInput(reason, Fault("/options/walkable", reason))
 
 
 def begin() -> TrackState:
@@ -93,32 +109,34 @@ def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
     reading, state = gathered(tracker, state, step)
     if reading is None:
         return _followed(replace(state, step=step), ())
-    before = state.recent.readings[-1] if state.recent.readings else None
-    recent = state.recent
+    said, recent = state.estimate, state.recent
+    before = recent.readings[-1] if recent.readings else None
     if before is not None and abs(reading.displacement_m[2] - recent.readings[0].displacement_m[2]) > STOREY_M:
         recent = Recent()  # a window is walked on one floor
     recent = recent.with_reading(reading, state.path_m, tracker.options.window_m)
     state = replace(state, step=step, recent=recent)
     state = _predict_nothing(tracker, state, before, reading)
     if state.particles is None:
+        settled: tuple[Smoothed, ...] = ()
         if before is None and (tracker.prior is not None or step.displacement_m is None):
             state = _start_around(tracker, state, step, rng)
-            settled: tuple[Smoothed, ...] = ()
             state, settled = _weigh(tracker, state, None, reading, rng)
         else:
-            state, settled = search(tracker, state, rng), ()
+            state = search(tracker, state, rng)
     else:
         state, settled = _weigh(tracker, state, before, reading, rng)
         if doubtful(tracker, state):
             state = search_again(tracker, state, rng)
+    if state.estimate is not said:
+        state = replace(state, estimate_from_m=reading.displacement_m)
     return _followed(_judged(tracker, state), settled)
 
 
 def _followed(state: TrackState, settled: tuple[Smoothed, ...]) -> Followed:
     """The belief, carried on to where the device is by now from where it was last compared with the map."""
-    estimate, step = state.estimate, state.step
-    if estimate is not None and step is not None and step.displacement_m is not None:
-        estimate = carried_on(estimate, step.displacement_m - state.recent.readings[-1].displacement_m)
+    estimate = state.estimate
+    if estimate is not None and state.place_m is not None and state.estimate_from_m is not None:
+        estimate = carried_on(estimate, state.place_m - state.estimate_from_m)
     return Followed(state, estimate, state.probability, settled)
 
 

@@ -51,18 +51,23 @@ class TrackState:
 
     step            the last one followed
     samples         since the last reading: how many, and in `gathered` the sums of their place, time and field
+    place_m         (3,) where the device last reckoned to be
+    unseen_m        that it may have walked since the last reading without knowing how
     course_rad      (2,) direction of the path at its start and now, in the track's frame; NaN: not known yet
     particles       None while they are searched for
     log_odds        how much better the particles predict the readings than no map does, kept to MOST_ODDS
     gains           (k, 2) distance walked and log odds gained, of the readings in `recent`
     searched_m      path at the last search
     tells_height    whether the device ever said that it rose or sank
+    estimate_from_m (3,) where the device reckoned to be when the estimate was made
     """
 
     step: Step | None = None
     samples: int = 0
     gathered: Array | None = None
     path_m: float = 0.0
+    place_m: Array | None = None
+    unseen_m: float = 0.0
     course_rad: tuple[float, float] = (np.nan, np.nan)
     course_from_m: Array | None = None
     recent: Recent = field(default_factory=Recent)
@@ -75,6 +80,7 @@ class TrackState:
     tells_height: bool = False
     state: State = "searching"
     estimate: Estimate | None = None
+    estimate_from_m: Array | None = None
     converged_at_m: float | None = None
 
     @property

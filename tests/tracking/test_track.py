@@ -295,3 +295,39 @@ def test_standing_still_and_a_step_without_a_reading_change_nothing_but_time(
     assert stood.state.state == walked.state.state
     np.testing.assert_allclose(stood.estimate.position_m, walked.estimate.position_m, atol=0.2)
     assert 0.5 < np.trace(stood.estimate.covariance_m2) / np.trace(walked.estimate.covariance_m2) < 2.0
+
+
+def test_a_walkable_area_and_its_walls_keep_the_belief_inside(
+    grids: dict[str, FieldGrid], carried_over: Callable[..., Any]
+) -> None:
+    """A corridor 2 m wide along x = 7: the belief is in it from the first place said."""
+    rng = np.random.default_rng(14)
+    device = carried_over(rng, grids["ground"], straight((7.0, 2.0), (7.2, 13.0)), noise_uT=4.0)
+    inside = lambda p: (np.abs(p[:, 0] - 7.0) < 1.0) & (p[:, 1] > 0.5) & (p[:, 1] < 14.5)  # noqa: E731
+    sides = np.array([[[6.0, 0.5], [6.0, 14.5]], [[8.0, 0.5], [8.0, 14.5]]])
+    ground = Ground(
+        walls={"ground": sides}, walkable={"ground": inside, "first": lambda p: np.zeros(len(p), dtype=bool)}
+    )
+    options = replace(FEW, noise_uT=4.0, ground=ground)
+    for each in walk_on(tracker_on(grids, options=options), device.steps):
+        if each.estimate is not None:
+            assert each.estimate.floor == 0
+            assert abs(each.estimate.position_m[0] - 7.0) < 1.05
+    nowhere = Ground(walkable=dict.fromkeys(("ground", "first"), lambda p: p[:, 0] > 1000.0))
+    with pytest.raises(InvalidInput, match="walkable area"):
+        tracker_on(grids, options=replace(FEW, ground=nowhere))
+
+
+def test_reckoning_may_fail_for_a_while(
+    grids: dict[str, FieldGrid], carried_over: Callable[..., Any], path_of: Callable[..., Array]
+) -> None:
+    """Steps without a displacement in mid-track: the belief widens, and narrows again when the device reckons on."""
+    rng = np.random.default_rng(15)
+    device = carried_over(rng, grids["ground"], path_of(rng, 22.0))
+    gap = range(100, 112)
+    steps = [replace(s, displacement_m=None) if k in gap else s for k, s in enumerate(device.steps)]
+    followed = walk_on(tracker_on(grids), steps)
+    assert followed[99].state.state == "converged"
+    errors = [error_m(each.estimate, p) for each, p in zip(followed, device.truth_m, strict=True) if each.estimate]
+    assert max(errors[-60:]) < 1.0
+    assert followed[-1].state.state == "converged"
