@@ -67,7 +67,7 @@ def move_between(
     return Advance(
         moved_m=moved[:2], distance_m=distance, risen_m=float(moved[2]),
         features_uT=features_of(reading.B_uT, places.components, frame, places.scale), noise_uT2=max(noise, 1e-6),
-        turn=turn, walk=walk, turns=vectors and frame == "level",
+        turn=turn, walk=walk, turns=vectors and frame == "level", strays=options.stray_nats_per_m * distance,
     )  # fmt: skip
 
 

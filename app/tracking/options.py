@@ -28,6 +28,8 @@ class TrackOptions:
     course_sd_rad, course_m      sd of the direction walked about the one the device is held in, and the distance over
                                  which it stays alike
     scale_m                      distance over which the scale stays alike
+    stray_nats_per_m             by which walking where nothing is mapped is less likely: people walk where surveyors
+                                 walked (after the soft road penalty of Shockley, L1349)
     speed_m_s                    of a device that does not know how it moves: how fast it may be
 
     particles                    most particles; `least_particles` the fewest, between them the KLD bound decides
@@ -50,6 +52,7 @@ class TrackOptions:
     course_sd_rad: float = 0.05
     course_m: float = 5.0
     scale_m: float = 100.0
+    stray_nats_per_m: float = 0.5
     speed_m_s: float = 1.0
 
     particles: int = 20_000

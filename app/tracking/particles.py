@@ -65,6 +65,7 @@ class Advance:
     walk          (6,) sds of this move's random walk of heading and of position along each axis; how much of course
                   and scale is kept, and the sds of what is new of each
     turns         whether a heading turns the features
+    strays        nats that this move costs on ground where nothing is mapped
     """
 
     moved_m: Array
@@ -75,6 +76,7 @@ class Advance:
     turn: Array
     walk: Array
     turns: bool
+    strays: float = 0.0
 
 
 def new_particles(
@@ -95,16 +97,16 @@ def advance(
     features = np.zeros(0) if move.features_uT is None else move.features_uT
     _advance(
         rows, particles.floor, log_weight, move.moved_m, move.distance_m, move.risen_m, features, move.noise_uT2,
-        np.ascontiguousarray(move.turn), move.walk, move.turns, noise, places.cells, places.planes, places.shapes,
-        places.floors, places.resolution_m, places.errors, len(places.scale), barriers,
+        np.ascontiguousarray(move.turn), move.walk, move.turns, move.strays, noise, places.cells, places.planes,
+        places.shapes, places.floors, places.resolution_m, places.errors, len(places.scale), barriers,
     )  # fmt: skip
     return Particles(rows, particles.floor, log_weight)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _advance(  # type: ignore[no-untyped-def]
-    rows, floor, log_weight, moved, distance, risen, features, noise_uT2, turn, walk, turns, noise, cells, planes,
-    shapes, floors, resolution, errors, c, barriers,
+    rows, floor, log_weight, moved, distance, risen, features, noise_uT2, turn, walk, turns, strays, noise, cells,
+    planes, shapes, floors, resolution, errors, c, barriers,
 ):  # fmt: skip
     n = len(rows)
     observed = len(features) > 0
@@ -160,7 +162,7 @@ def _advance(  # type: ignore[no-untyped-def]
             row[_V + k] = v_k + gain_v * y_k
             row[_F + k] = f_k + gain_f * y_k
             squares += y_k * y_k
-        log_weight[i] -= 0.5 * (squares / total + c * np.log(6.283185307179586 * total))
+        log_weight[i] -= 0.5 * (squares / total + c * np.log(6.283185307179586 * total)) + strays * (1.0 - measured)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
