@@ -204,10 +204,10 @@ class Job(Base):
 
 
 class Track(Base):
-    """`status`: active, ended. `spec` is what it is followed by, pinned when it was made: floors with their maps, options,
-    prior and ground (`app.services.track_spec`). `version` grows with every write, so that whoever followed from an older
-    one is noticed. `waiting` are steps that came before one that is missing, `gaps` numbers that were given up:
-    [first, stop). `ended_reason`: idle, asked."""
+    """`status`: active, ended. `spec` is what it is followed by, pinned when it was made: floors with their maps,
+    options, prior and ground (`app.services.track_spec`). `version` grows with every write, so that whoever followed
+    from an older one is noticed. `waiting` are steps that came before one that is missing, `gaps` numbers that were
+    given up: [first, stop). `ended_reason`: idle, asked."""
 
     __tablename__ = "track"
     __table_args__ = (
