@@ -42,6 +42,7 @@ from app.positioning.locate import warm_up
 from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing, ensure_admin_key
+from app.services.follow_warm_up import warm_up_tracks
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
 from app.settings import Settings
@@ -169,6 +170,7 @@ def _get_ready() -> None:
     every thread for more than 0.1 s, and a busy server would do so about once a second.
     """
     warm_up()
+    warm_up_tracks()
     gc.collect()
     gc.freeze()
 

@@ -2,8 +2,8 @@
 
 The first message says which number is waited for, so that a client that lost its connection goes on from there. What
 has arrived while a batch was followed is the next batch: a fast device is answered less often, never late. Reading
-stops while too much waits, and TCP then slows the sender down. Several connections to one track take turns, batch by batch;
-a step that both send is a duplicate to one of them.
+stops while too much waits, and TCP then slows the sender down. Several connections to one track take turns, batch by
+batch; a step that both send is a duplicate to one of them.
 
 A message of ours is `{"type": "ready" | "estimate" | "problem", ...}`; of the client's `{"type": "steps", "steps":
 [...], "flush"?}`, or a single step `{"type": "step", "number", ...}`.

@@ -124,7 +124,7 @@ def _write_all(connection: Connection, writes: Sequence[Write]) -> set[str]:
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql("BEGIN IMMEDIATE")  # before the versions are read
     ids = [write.track_id for write in writes]
-    versions = dict(connection.execute(_VERSIONS, {"ids": ids}).tuples().all())
+    versions = {row.id: row.version for row in connection.execute(_VERSIONS, {"ids": ids})}
     taken = [write for write in writes if versions.get(write.track_id) == write.version]
     if taken:
         now = utc_now()
