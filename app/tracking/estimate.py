@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.geometry import Array, wrap_angle_rad
-from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Z, Particles, effective_sample_size
+from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Particles, Z, effective_sample_size
 
 __all__ = ["Estimate", "Spot", "State", "carried_on", "describe", "kld_sample_size", "occupied_bins"]
 
@@ -87,7 +87,7 @@ def describe(particles: Particles, weight: Array, floors: int, map_variance_m2: 
         heading_sd_rad=float(np.sqrt(w @ np.square(turned))),
         radius_68_m=radii[0],
         radius_95_m=radii[1],
-        floor_probability=np.bincount(particles.floor, weights=weight, minlength=floors),
+        floor_probability=np.asarray(np.bincount(particles.floor, weights=weight, minlength=floors), dtype=np.float64),
         spots=tuple(spots),
         concentration=best.probability,
         measured=float(w @ rows[:, MEASURED]),

@@ -15,6 +15,8 @@ from app.tracking.recent import Reading
 
 __all__ = ["Moves", "features_of", "move_between", "offset_variance_uT2", "window_moves"]
 
+STRAIGHT_S = 1.0  # how long somebody walks straight on, of whom nothing is known
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moves:
@@ -44,8 +46,11 @@ def move_between(
 ) -> Advance:
     """The move from one reading to the next (from None: no way at all)."""
     moved = np.zeros(3) if before is None else reading.displacement_m - before.displacement_m
-    distance = float(np.hypot(moved[0], moved[1]))
+    distance = float(np.linalg.norm(moved)) + reading.unseen_m
     root = float(np.sqrt(distance))
+    strayed = root * options.position_walk_m
+    if reading.unseen_m > 0.0:
+        strayed = float(np.sqrt(reading.unseen_m * options.speed_m_s * STRAIGHT_S))
     turned = frame != "building"
     vectors = places.components == "vector"
     if reading.device_to_frame is not None:
@@ -54,7 +59,7 @@ def move_between(
         turn = yaw_matrix(-reading.yaw_rad) if vectors and turned else np.eye(3)
     kept_course, kept_scale = np.exp(-distance / options.course_m), np.exp(-distance / options.scale_m)
     walk = np.array([
-        root * options.heading_walk_rad if turned else 0.0, root * options.position_walk_m,
+        root * options.heading_walk_rad if turned else 0.0, strayed,
         kept_course, options.course_sd_rad * np.sqrt(1.0 - kept_course**2),
         kept_scale, options.step_scale_sd * np.sqrt(1.0 - kept_scale**2),
     ])  # fmt: skip

@@ -1,8 +1,9 @@
 """The hypothesis that the map knows nothing of where the device is, told reading after reading.
 
-The field is then a constant, about which nothing is known but the Earth's strength, plus a smooth process of the map's own
-variance and steepness, under the errors of a typical place of the map (as `app.positioning.off_map` has it for windows). How much better the particles predict the
-readings than this hypothesis does is the evidence that they follow the device.
+The field is then a constant, about which nothing is known but the Earth's strength, plus a smooth process of the map's
+own variance and steepness, under the errors of a typical place of the map (as `app.positioning.off_map` has it for
+windows). How much better the particles predict the readings than this hypothesis does is the evidence that they follow
+the device.
 """
 
 from dataclasses import dataclass

@@ -25,13 +25,14 @@ class TrackOptions:
     heading_drift_sd_rad_per_m   sd of the rate by which the track's frame turns, over the whole track
     heading_walk_rad             sd of the heading's random walk, per square root of metre
     position_walk_m              sd of the position's random walk, per square root of metre
-    course_sd_rad, course_m      sd of the direction walked about the one the device is held in, and over which distance it
-                                 stays alike
+    course_sd_rad, course_m      sd of the direction walked about the one the device is held in, and the distance over
+                                 which it stays alike
     scale_m                      distance over which the scale stays alike
     speed_m_s                    of a device that does not know how it moves: how fast it may be
 
     particles                    most particles; `least_particles` the fewest, between them the KLD bound decides
-    update_m, update_rad         a reading counts once the device has moved or turned this far: until then it is averaged
+    update_m, update_rad         readings are averaged until the device has moved (a cell of the map at least) or turned
+                                 this far
     window_m                     length of the windows that are searched for globally
     converged_probability        that the place said is right, for the state "converged"; below `lost_probability` a
                                  track that was converged is "lost"
@@ -57,7 +58,7 @@ class TrackOptions:
     update_rad: float = 0.3
     window_m: float = 15.0
     converged_probability: float = 0.95
-    lost_probability: float = 0.5
+    lost_probability: float = 0.7
     converged_radius_m: float = 2.5
     lag_m: float = 10.0
     ground: Ground | None = None

@@ -1,12 +1,12 @@
-"""Particles that carry what can be integrated exactly (Rao-Blackwell): the sensor's offset, and errors alike along the walk.
+"""Particles that carry what is integrated exactly (Rao-Blackwell): the sensor's offset, errors alike along the walk.
 
 A particle is a pose. Given its path, readings are a linear Gaussian function of an offset b, constant in the sensor's
 axes, and of two processes of unit variance, of correlations exp(-d / l) over the distance walked:
     T_k (z_k - R(-heading) m(p)) = b + sigma(p) v_k + s(p) f_k + white noise,
-so each particle has a Kalman filter over (b, v, f), whose covariance all components share. v is walk noise: with b this is
-the covariance that windows are scored under (`app.positioning.window_error`), told step after step. f is the field itself
-where nothing is mapped, as smooth as the map is: such a place predicts what a smooth field would, under the same errors
-as a place that is mapped, and gains nothing over it.
+so each particle has a Kalman filter over (b, v, f), whose covariance all components share. v is walk noise: with b this
+is the covariance that windows are scored under (`app.positioning.window_error`), told step after step. f is the field
+itself where nothing is mapped, as smooth as the map is: such a place predicts what a smooth field would, under the same
+errors as a place that is mapped, and gains nothing over it.
 """
 
 from dataclasses import dataclass, replace
@@ -20,8 +20,8 @@ from app.tracking.ground import Barriers
 from app.tracking.places import Places
 
 __all__ = [
-    "COLUMNS", "COURSE", "DRAWS", "DRIFT", "HEADING", "MEASURED", "SCALE", "X", "Y", "Z", "Advance", "Particles", "advance",
-    "effective_sample_size", "log_evidence", "new_particles", "resample", "weights",
+    "COLUMNS", "COURSE", "DRAWS", "DRIFT", "HEADING", "MEASURED", "SCALE", "X", "Y", "Z", "Advance", "Particles",
+    "advance", "effective_sample_size", "log_evidence", "new_particles", "resample", "weights",
 ]  # fmt: skip
 
 X, Y, Z, HEADING, COURSE, SCALE, DRIFT, MEASURED = 0, 1, 2, 3, 4, 5, 6, 7
@@ -29,6 +29,7 @@ _BB, _BV, _BF, _VV, _VF, _FF, _B, _V, _F = 8, 9, 10, 11, 12, 13, 14, 17, 20
 COLUMNS = 23
 DRAWS = 5
 _CROSSING = 8.0  # nats that a path through a wall costs: plans err, too
+_BETWEEN_FLOORS_M = 1.0  # this far above or below the map of a floor nothing is mapped
 _MEASURED_M = 5.0  # over which "measured" is remembered
 
 
@@ -175,6 +176,7 @@ def _look_up(x, y, z, floor, cells, planes, shapes, floors, resolution, c, mean)
     for k in range(c):
         mean[k] = 0.0
     variance, measured = 0.0, 0.0
+    on_floor = planes[first, 2] - _BETWEEN_FLOORS_M < z < planes[first + count - 1, 2] + _BETWEEN_FLOORS_M
     width = c + 2
     for layer in range(2):
         plane, part = (below, 1.0 - share) if layer == 0 else (above, share)
@@ -193,7 +195,7 @@ def _look_up(x, y, z, floor, cells, planes, shapes, floors, resolution, c, mean)
             for k in range(c):
                 mean[k] += w * cells[at + k]
             variance += w * cells[at + c]
-            if a == j + dj and b == i + di:
+            if on_floor and a == j + dj and b == i + di:
                 measured += w * cells[at + c + 1]
     return variance, measured
 
@@ -243,9 +245,9 @@ def effective_sample_size(weight: Array) -> float:
 
 
 def resample(particles: Particles, weight: Array, count: int, draw: float) -> tuple[Particles, NDArray[np.int64]]:
-    """Systematic resampling with one uniform draw (Kuevor, L1565): `count` particles of one weight, whose sum is that of
+    """Systematic resampling with one uniform draw (Kuevor, L1565): `count` particles of one weight, together as
 
-    the old ones, and whose each was drawn from which.
+    heavy as the old ones; and from which each was drawn.
     """
     edges = np.cumsum(weight)
     chosen = np.searchsorted(edges, (draw + np.arange(count)) / count * edges[-1], side="right")

@@ -1,7 +1,7 @@
 """The maps of the floors as the filter reads them: features, their variance, and whether anything was measured.
 
-Every floor is one or more planes (its map's heights); all planes lie in one flat array, cell after cell, for the compiled
-loops. Features and scaling are those of the search (`app.positioning.floors`), so that both judge a place alike.
+Every floor is one or more planes (its map's heights); all planes lie in one flat array, cell after cell, for the
+compiled loops. Features and scaling are those of the search (`app.positioning.floors`): both judge a place alike.
 """
 
 from collections.abc import Sequence
@@ -31,6 +31,7 @@ class Places:
     floors        (f, 2) first plane of a floor, and how many it has
     resolution_m  (p,)
     heights_m     (f,) where a device is held on each floor: the height of its map's middle plane
+    lowest_m, highest_m   (f,) of its map
     errors        (5,) walk share, white share, 1 / walk length; sd of the field where nothing is mapped, and 1 / its
                   correlation length
     prior_variance_uT2, ambient_uT   (c,) the field where nothing is mapped
@@ -45,6 +46,8 @@ class Places:
     floors: NDArray[np.int64]
     resolution_m: Array
     heights_m: Array
+    lowest_m: Array
+    highest_m: Array
     errors: Array
     ambient_uT: Array
     prior_variance_uT2: Array
@@ -77,6 +80,8 @@ def make_places(floors: Sequence[SearchableFloor]) -> Places:
         floors=np.stack([first, counts], axis=1).astype(np.int64),
         resolution_m=np.array([plane.resolution_m for _, _, plane in planes]),
         heights_m=np.array([floor.planes[len(floor.planes) // 2].height_m for floor in floors]),
+        lowest_m=np.array([floor.planes[0].height_m for floor in floors]),
+        highest_m=np.array([floor.planes[-1].height_m for floor in floors]),
         errors=np.array([
             structure.walk_share, structure.white_share, 1.0 / structure.walk_length_m,
             float(np.sqrt(np.mean(variance))), 1.0 / process.length_m,

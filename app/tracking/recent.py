@@ -19,6 +19,7 @@ class Reading:
     samples          how many they were
     displacement_m   (3,) where they were taken, on average
     yaw_rad, device_to_frame   of the device at the last of them
+    unseen_m         that a device which does not know how it moves may have walked since the reading before
     """
 
     number: int
@@ -28,6 +29,7 @@ class Reading:
     displacement_m: Array
     yaw_rad: float
     device_to_frame: Array | None
+    unseen_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,17 +27,18 @@ from app.tracking.particles import (
     HEADING,
     MEASURED,
     SCALE,
+    Particles,
     X,
     Y,
     Z,
-    Particles,
     advance,
     log_evidence,
     new_particles,
 )
 from app.tracking.places import Places
+from app.tracking.step import Step
 
-__all__ = ["Found", "find", "particles_around"]
+__all__ = ["Found", "find", "spread"]
 
 _STILL = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
 
@@ -81,28 +82,48 @@ def find(
     return Found(replace(weighed, log_weight=even), history, log_ratio)
 
 
-def particles_around(
-    prior: StartPrior, places: Places, heading_rad: float | None, heading_sd_rad: float | None,
-    offset_variance_uT2: float, options: TrackOptions, frame: WindowFrame, rng: np.random.Generator,
+def spread(
+    floors: Sequence[SearchableFloor], places: Places, prior: StartPrior | None, step: Step, frame: WindowFrame,
+    options: TrackOptions, offset_variance_uT2: float, rng: np.random.Generator,
 ) -> Particles:  # fmt: skip
-    """Particles about a place that was told, on the floors whose heights agree with it."""
+    """Particles about a place that was told, on the floors whose heights agree with it; or wherever there is a map."""
     n = options.particles
-    position = np.asarray(prior.position_m) + prior.sd_m * rng.normal(size=(n, 3))
-    gap = np.abs(position[:, 2:] - places.heights_m)
-    floor = np.argmin(gap, axis=1)
-    position[:, 2] = places.heights_m[floor]
-    if frame == "building":
-        heading = np.zeros(n)
-    elif heading_rad is None:
-        heading = rng.uniform(-np.pi, np.pi, n)
+    if prior is None:
+        position, floor = _anywhere(floors, n, rng)
     else:
-        heading = heading_rad + (heading_sd_rad or 0.0) * rng.normal(size=n)
+        position = np.asarray(prior.position_m) + prior.sd_m * rng.normal(size=(n, 3))
+        floor = np.argmin(np.abs(position[:, 2:] - places.heights_m), axis=1)
+        position[:, 2] = np.clip(position[:, 2], places.lowest_m[floor], places.highest_m[floor])
+    turned = frame == "level"
+    heading = rng.uniform(-np.pi, np.pi, n) if frame != "building" else np.zeros(n)
+    if turned and step.heading_rad is not None:
+        heading = step.heading_rad + (step.heading_sd_rad or 0.0) * rng.normal(size=n)
     particles = new_particles(position, floor, heading, offset_variance_uT2)
     particles.rows[:, SCALE] += options.step_scale_sd * rng.normal(size=n)
     particles.rows[:, COURSE] = options.course_sd_rad * rng.normal(size=n)
     if frame != "building":
         particles.rows[:, DRIFT] = options.heading_drift_sd_rad_per_m * rng.normal(size=n)
     return replace(particles, log_weight=np.full(n, -np.log(n)))
+
+
+def _anywhere(
+    floors: Sequence[SearchableFloor], count: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.int64]]:
+    """Positions (n, 3) and floors, evenly over all that is mapped."""
+    cells = []
+    for k, floor in enumerate(floors):
+        plane = floor.planes[len(floor.planes) // 2]
+        row, column = np.nonzero(plane.measured)
+        x0, y0 = plane.origin_m
+        size = np.full(len(row), plane.resolution_m)
+        cells.append(np.column_stack([
+            x0 + size * column, y0 + size * row, np.full(len(row), plane.height_m), np.full(len(row), k), size,
+        ]))  # fmt: skip
+    cell = np.concatenate(cells)
+    chosen = cell[rng.choice(len(cell), count, p=cell[:, 4] ** 2 / np.sum(cell[:, 4] ** 2))]
+    position = chosen[:, :3].copy()
+    position[:, :2] += chosen[:, 4:] * rng.uniform(-0.5, 0.5, size=(count, 2))
+    return position, chosen[:, 3].astype(np.int64)
 
 
 def _draw(

@@ -16,8 +16,8 @@ class Step:
     number             counts from zero; a step of a number that was followed already is not followed again
     t_s                seconds; does not decrease
     B_uT               (3,) in the track's frame, (1,) of "norm", or None: nothing was measured
-    displacement_m     (3,) where the device is by its own reckoning, from the first step, in the track's frame; None: the
-                       device does not know how it moves
+    displacement_m     (3,) where the device is by its own reckoning, from the first step, in the track's frame; None:
+                       it does not know how it moves
     yaw_rad            of the device since the first step (None: it turns with the path)
     device_to_frame    (3, 3) rotation of the sensor's axes to the track's frame, or None: level, turned by yaw_rad
     heading_rad, heading_sd_rad   yaw of the track's frame in the building as the device believes it now (None: unknown)

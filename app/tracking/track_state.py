@@ -1,0 +1,79 @@
+"""What a track is followed with, and all that changes along it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import expit
+
+from app.geometry import Array
+from app.positioning.floors import SearchableFloor
+from app.positioning.window import WindowFrame
+from app.tracking.estimate import Estimate, State
+from app.tracking.ground import Barriers
+from app.tracking.no_map import NoMap
+from app.tracking.options import StartPrior, TrackOptions
+from app.tracking.particles import Particles
+from app.tracking.places import Places
+from app.tracking.recent import Recent
+from app.tracking.smoother import Lag
+from app.tracking.step import Step
+
+__all__ = ["MOST_ODDS", "TrackState", "Tracker"]
+
+MOST_ODDS = 7.0  # nats: evidence is not hoarded, so that a device that leaves the map is noticed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracker:
+    """What stays the same along a track: maps, what is known of the device, and the seed."""
+
+    floors: tuple[SearchableFloor, ...]
+    places: Places
+    barriers: Barriers
+    frame: WindowFrame
+    options: TrackOptions
+    seed: int
+    prior: StartPrior | None = None
+
+    @property
+    def spacing_m(self) -> float:
+        """Of readings: nearer ones meet the same cell of the map."""
+        return max(self.options.update_m, float(self.places.resolution_m.min()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackState:
+    """Everything that changes.
+
+    step            the last one followed
+    samples         since the last reading: how many, and in `gathered` the sums of their place, time and field
+    course_rad      (2,) direction of the path at its start and now, in the track's frame; NaN: not known yet
+    particles       None while they are searched for
+    log_odds        how much better the particles predict the readings than no map does, kept to MOST_ODDS
+    gains           (k, 2) distance walked and log odds gained, of the readings in `recent`
+    searched_m      path at the last search
+    tells_height    whether the device ever said that it rose or sank
+    """
+
+    step: Step | None = None
+    samples: int = 0
+    gathered: Array | None = None
+    path_m: float = 0.0
+    course_rad: tuple[float, float] = (np.nan, np.nan)
+    course_from_m: Array | None = None
+    recent: Recent = field(default_factory=Recent)
+    particles: Particles | None = None
+    lag: Lag | None = None
+    no_map: NoMap | None = None
+    log_odds: float = 0.0
+    gains: tuple[tuple[float, float], ...] = ()
+    searched_m: float = 0.0
+    tells_height: bool = False
+    state: State = "searching"
+    estimate: Estimate | None = None
+    converged_at_m: float | None = None
+
+    @property
+    def probability(self) -> float:
+        """That the particles follow the device."""
+        return 0.0 if self.particles is None else float(expit(self.log_odds))
