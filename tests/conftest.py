@@ -56,12 +56,12 @@ def hall_uT(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def hall_grid() -> FieldGrid:
-    """Its map, as good as a map can be."""
-    x, y = np.meshgrid(np.arange(0.0, 12.01, 0.25), np.arange(0.0, 8.01, 0.25))
+    """Its map, as good as a map can be, and 3 m more on every side."""
+    x, y = np.meshgrid(np.arange(-3.0, 15.01, 0.25), np.arange(-3.0, 11.01, 0.25))
     mean = hall_uT(x, y)[None]
     gradient = np.stack([np.gradient(mean, 0.25, axis=2), np.gradient(mean, 0.25, axis=1)], axis=-1)
     return FieldGrid(
-        "vector", (0.0, 0.0), 0.25, np.array([1.2]), mean.astype(np.float32), np.full(mean.shape, 0.3, np.float32),
+        "vector", (-3.0, -3.0), 0.25, np.array([1.2]), mean.astype(np.float32), np.full(mean.shape, 0.3, np.float32),
         gradient.astype(np.float32), np.ones(mean.shape[:3], dtype=np.bool_), np.array([18.0, 3.0, -42.0]),
         np.full(3, 5.0), np.full(3, 0.4), 0.0, ErrorStructure(0.0, 0.0, 1.0, 1.0),
     )  # fmt: skip

@@ -26,7 +26,8 @@ from app.services.track_log import Batch, TrackLog, Write, batches_of, end_idle,
 from app.services.track_spec import Trackers
 from app.services.track_steps import core_step
 from app.tracking.stored_state import state_from_bytes, state_nbytes, state_to_bytes
-from app.tracking.track import Followed, Tracker, TrackState, begin, follow
+from app.tracking.track import Followed, begin, follow
+from app.tracking.track_state import Tracker, TrackState
 
 __all__ = ["Follower", "Live", "Outcome", "follow_steps"]
 

@@ -8,7 +8,8 @@ from app.tracking.estimate import Estimate
 from app.tracking.particles import weights
 from app.tracking.smoother import Smoothed, settle
 from app.tracking.step import Step
-from app.tracking.track import Followed, Tracker, TrackState
+from app.tracking.track import Followed
+from app.tracking.track_state import Tracker, TrackState
 
 __all__ = ["PATH_NAMES", "SEARCHING", "Told", "path_row", "settled_row", "tell", "unsettled_rows"]
 
@@ -45,7 +46,7 @@ def tell(tracker: Tracker, followed: Followed) -> Told:
     told = {
         **SEARCHING,
         "state": state.state,
-        "reason": _reason(tracker, state, estimate),
+        "reason": _reason(state, estimate),
         "step": state.step.number,
         "t_s": state.step.t_s,
         "probability": followed.probability,
@@ -83,7 +84,7 @@ def _share(p: float) -> float:
     return min(float(p), 1.0)
 
 
-def _reason(tracker: Tracker, state: TrackState, estimate: Estimate | None) -> str | None:
+def _reason(state: TrackState, estimate: Estimate | None) -> str | None:
     """Why it is not converged, and what would help."""
     if state.state == "converged":
         return None
@@ -94,16 +95,12 @@ def _reason(tracker: Tracker, state: TrackState, estimate: Estimate | None) -> s
     if estimate is not None:
         spread_m = 2.0 * estimate.radius_95_m
         return f"several places fit so far, within {spread_m:.1f} m or elsewhere; walk on, best around a corner"
-    return _nothing_found(tracker, state)
+    return _nothing_found(state)
 
 
-def _nothing_found(tracker: Tracker, state: TrackState) -> str:
-    step = state.step
-    assert step is not None
+def _nothing_found(state: TrackState) -> str:
     if not state.recent.readings:
         return "nothing was measured yet; send steps with b_ut"
-    if step.displacement_m is None and tracker.prior is None:
-        return "a device that does not say how it moves is not searched for; send displacement_m, or start with a prior"
     return f"{state.path_m:.1f} m were walked so far; walk on: a few metres are searched for at a time"
 
 

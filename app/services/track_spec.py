@@ -21,7 +21,8 @@ from app.services.grid_cache import GridCache
 from app.services.locate_window import ActiveMap
 from app.tracking.ground import Connector, Ground, barriers_of
 from app.tracking.options import StartPrior, TrackOptions
-from app.tracking.track import Tracker, make_tracker
+from app.tracking.track import make_tracker
+from app.tracking.track_state import Tracker
 
 __all__ = ["CORE_FRAME", "TrackSpec", "Trackers", "check_walkable", "make_spec"]
 

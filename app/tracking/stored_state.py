@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import CorruptArtefact
-from app.tracking.track import TrackState
+from app.tracking.track_state import TrackState
 
 __all__ = ["state_from_bytes", "state_nbytes", "state_to_bytes"]
 

@@ -153,7 +153,9 @@ def test_a_restart_goes_on_as_if_there_was_none(
     with world.sessions.begin() as session:
         session.get_one(TrackState, disturbed.id).data = b"damaged"
     more = hall_steps(count=320)[300:]
-    assert send(world.follower(), disturbed, more)[-1].estimate == send(world.follower(), undisturbed, more)[-1].estimate
+    assert (
+        send(world.follower(), disturbed, more)[-1].estimate == send(world.follower(), undisturbed, more)[-1].estimate
+    )
 
 
 def test_two_processes_on_one_track_notice_each_other(world: World, hall_steps: Callable[..., Steps]) -> None:
