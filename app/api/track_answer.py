@@ -184,7 +184,7 @@ def _point(told: Mapping[str, Any], floor_ids: Sequence[str]) -> PathPoint:
     return PathPoint(
         step=told["step"], t_s=told["t_s"], state=told["state"], floor_id=floor_ids[told["floor_id"]],
         position_m=[told["x_m"], told["y_m"], told["z_m"]],
-        covariance_m2=[[told["xx_m2"], told["xy_m2"]], [told["xy_m2"], told["yy_m2"]]],
+        covariance_m2=[[told["xx_m2"], told["xy_m2"]], [told["yx_m2"], told["yy_m2"]]],
         heading_rad=told["heading_rad"], radius_68_m=told["radius_68_m"], radius_95_m=told["radius_95_m"],
         probability=told["probability"],
     )  # fmt: skip
@@ -197,6 +197,6 @@ def smoothed_points(
     last = {row[0]: (row, True) for row in settled} | {row[0]: (row, False) for row in open_rows}
     return [
         PathPoint(step=row[0], t_s=row[1], settled=done, floor_id=floor_ids[row[2]], position_m=list(row[3:6]),
-                  covariance_m2=[[row[6], row[7]], [row[7], row[8]]])
+                  covariance_m2=[list(row[6:8]), list(row[8:10])])
         for row, done in (last[number] for number in sorted(last))
     ]  # fmt: skip

@@ -16,7 +16,7 @@ __all__ = ["PATH_NAMES", "SEARCHING", "Told", "path_row", "settled_row", "tell",
 Told = dict[str, Any]
 
 PATH_NAMES = (
-    "step", "t_s", "state", "floor_id", "x_m", "y_m", "z_m", "xx_m2", "xy_m2", "yy_m2", "heading_rad", "radius_68_m",
+    "step", "t_s", "state", "floor_id", "x_m", "y_m", "z_m", "xx_m2", "xy_m2", "yx_m2", "yy_m2", "heading_rad", "radius_68_m",
     "radius_95_m", "probability",
 )  # fmt: skip
 """Columns of a path's row; floors by their index, and nothing after `state` where nothing was found yet."""
@@ -112,15 +112,15 @@ def path_row(step: Step, followed: Followed) -> list[Any]:
         return row
     c = estimate.covariance_m2
     return [
-        *row, estimate.floor, *estimate.position_m, float(c[0, 0]), float(c[0, 1]), float(c[1, 1]),
+        *row, estimate.floor, *estimate.position_m, *c.ravel().tolist(),
         float(estimate.heading_rad), float(estimate.radius_68_m), float(estimate.radius_95_m), followed.probability,
     ]  # fmt: skip
 
 
 def settled_row(place: Smoothed) -> list[Any]:
-    """A smoothed place: step, time, index of the floor, x, y, z, and its covariance xx, xy, yy."""
+    """A smoothed place: step, time, index of the floor, x, y, z, and its covariance row by row."""
     c = place.covariance_m2
-    return [place.node.number, place.node.t_s, place.floor, *place.position_m, *map(float, (c[0, 0], c[0, 1], c[1, 1]))]
+    return [place.node.number, place.node.t_s, place.floor, *place.position_m, *c.ravel().tolist()]
 
 
 def unsettled_rows(state: TrackState) -> list[list[Any]]:
