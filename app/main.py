@@ -40,9 +40,9 @@ from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
 from app.positioning.locate import warm_up
 from app.services.follow import Follower
+from app.services.follow_warm_up import warm_up_tracks
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing, ensure_admin_key
-from app.services.follow_warm_up import warm_up_tracks
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
 from app.settings import Settings

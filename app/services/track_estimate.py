@@ -16,8 +16,8 @@ __all__ = ["PATH_NAMES", "SEARCHING", "Told", "path_row", "settled_row", "tell",
 Told = dict[str, Any]
 
 PATH_NAMES = (
-    "step", "t_s", "state", "floor_id", "x_m", "y_m", "z_m", "xx_m2", "xy_m2", "yx_m2", "yy_m2", "heading_rad", "radius_68_m",
-    "radius_95_m", "probability",
+    "step", "t_s", "state", "floor_id", "x_m", "y_m", "z_m", "xx_m2", "xy_m2", "yx_m2", "yy_m2", "heading_rad",
+    "radius_68_m", "radius_95_m", "probability",
 )  # fmt: skip
 """Columns of a path's row; floors by their index, and nothing after `state` where nothing was found yet."""
 

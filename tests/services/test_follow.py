@@ -1,4 +1,4 @@
-"""Following with storage: the same steps give the same track, bit for bit, through restarts and in several processes."""
+"""Following with storage: the same steps give the same track, bit for bit, after restarts and by several processes."""
 
 import asyncio
 from collections.abc import Callable, Iterator
@@ -54,8 +54,8 @@ class World:
             key = session.scalars(select(Key)).first()
             assert key is not None
             row = Track(
-                organisation_id=key.organisation_id, key_id=key.id, building_id=self.building_id, frame=frame, seed=seed,
-                spec=self.spec(**more),
+                organisation_id=key.organisation_id, key_id=key.id, building_id=self.building_id, frame=frame,
+                seed=seed, spec=self.spec(**more),
             )  # fmt: skip
             session.add(row)
         return row
