@@ -1,6 +1,7 @@
 """What a client asks of a track: how it is to be followed, and the steps; and the same for the services."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -115,6 +116,9 @@ class TrackOptionsBody(RequestModel):
     scale_m: float | None = _positive(10_000, "distance over which the displacements' scale stays alike")
     speed_m_s: float | None = _positive(10, "of a device that does not know how it moves: how fast it may be")
     particles: Annotated[int | None, Field(ge=100, le=50_000, description="most particles")] = None
+    least_particles: Annotated[
+        int | None, Field(ge=100, le=50_000, description="fewest; between the two, as many as the belief needs")
+    ] = None
     update_m: float | None = _positive(5, "readings count once the device has moved this far")
     window_m: float | None = Field(
         default=None, ge=4, le=60, allow_inf_nan=False, description="length of what is searched for globally"
@@ -170,8 +174,7 @@ def core_options(body: TrackOptionsBody) -> TrackOptions:
     named = {"noise_uT" if name == "noise_ut" else "bias_sd_uT" if name == "bias_sd_ut" else name: value
              for name, value in told.items()}  # fmt: skip
     options = TrackOptions(**named)
-    fewest = min(options.least_particles, options.particles)
-    return TrackOptions(**named, least_particles=fewest)
+    return replace(options, least_particles=min(options.least_particles, options.particles))
 
 
 def core_prior(body: PriorBody | None) -> StartPrior | None:

@@ -36,8 +36,8 @@ router = APIRouter()
 
 PROTOCOL, BEARER = "isodyn.v1", "bearer."
 CLOSE_UNAUTHORISED, CLOSE_NOT_FOUND, CLOSE_ENDED, CLOSE_UNAVAILABLE = 4401, 4404, 4409, 1013
-MOST_MESSAGES = 64
-"""Read ahead of the batch in work; the server's own queue, and TCP's, come after it."""
+MOST_AHEAD_BYTES = 2**20
+"""Read ahead of the batch in work: minutes of a fast device's steps. The server's own queue, and TCP's, come after."""
 _CLOSES: dict[type[IsodynError], int] = {
     Unauthorised: CLOSE_UNAUTHORISED, Forbidden: CLOSE_UNAUTHORISED, NotFound: CLOSE_NOT_FOUND, Conflict: CLOSE_ENDED,
 }  # fmt: skip
@@ -98,7 +98,8 @@ class _Stream:
     def __init__(self, browser: WebSocket, context: Context, secret: str | None, track_id: str, frame: str) -> None:
         self._browser, self._context, self._secret = browser, context, secret
         self._track_id, self._frame = track_id, frame
-        self._read: asyncio.Queue[str | bytes | None] = asyncio.Queue(MOST_MESSAGES)
+        self._read: asyncio.Queue[str | bytes | None] = asyncio.Queue()
+        self._ahead_bytes, self._room = 0, asyncio.Event()
         self._gone = False
 
     async def run(self, ready: dict[str, Any]) -> None:
@@ -108,22 +109,27 @@ class _Stream:
             while not self._gone and (first := await self._read.get()) is not None:
                 if not await self._answer(self._with_waiting(first)):
                     return
-        except (WebSocketDisconnect, RuntimeError):  # gone while it was answered: what was followed is stored
-            return
+        except (WebSocketDisconnect, RuntimeError, asyncio.CancelledError):
+            return  # gone, or the server stops, while it was answered: what was followed is stored
         finally:
             reading.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await reading
 
     async def _read_on(self) -> None:
-        """Until the client goes; waits while the queue is full, and the client with it."""
+        """Until the client goes; waits while too much is read ahead, and the client with it."""
         while True:
+            while self._ahead_bytes > MOST_AHEAD_BYTES:
+                self._room.clear()
+                await self._room.wait()
             message = await self._browser.receive()
             if message["type"] == "websocket.disconnect":
                 await self._read.put(None)
                 return
             text = message.get("text")
-            await self._read.put(text if text is not None else message.get("bytes", b""))
+            told = text if text is not None else message.get("bytes", b"")
+            self._ahead_bytes += len(told)
+            await self._read.put(told)
 
     def _with_waiting(self, first: str | bytes) -> list[str | bytes]:
         """The first message and those that came meanwhile."""
@@ -134,6 +140,8 @@ class _Stream:
                 self._gone = True
                 break
             messages.append(another)
+        self._ahead_bytes -= sum(map(len, messages))
+        self._room.set()
         return messages
 
     async def _answer(self, messages: Sequence[str | bytes]) -> bool:

@@ -16,7 +16,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Subprotocol
 
-from app.api.track_stream import MOST_MESSAGES
+from app.api.track_stream import MOST_AHEAD_BYTES
 from app.main import create_app, first_start
 from app.services.manage_keys import create_key, revoke_key
 from app.settings import Settings
@@ -300,7 +300,7 @@ def test_a_client_that_does_not_read_is_slowed_down_and_loses_nothing(
     served: Served, hall_steps: Callable[..., Steps], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While the server is kept from following, what it reads ahead stays bounded, and sending comes to a halt."""
-    steps, track = hall_steps(count=300), served.new_track()
+    steps, track = hall_steps(count=600), served.new_track()
     follower, held = served.app.state.context.follower, threading.Event()
     follow = follower.follow
     sizes: list[int] = []
@@ -332,13 +332,13 @@ def test_a_client_that_does_not_read_is_slowed_down_and_loses_nothing(
             await asyncio.sleep(0.3)
             assert came == halted
             held.set()
-            reading = asyncio.create_task(read_until(stream, 300))
+            reading = asyncio.create_task(read_until(stream, 600))
             await sending
-            assert (await reading)[-1]["next_step"] == 300
+            assert (await reading)[-1]["next_step"] == 600
 
     asyncio.run(run())
-    assert max(sizes) <= MOST_MESSAGES + 1
-    assert [e["number"] for e in served.http.get(f"/v1/tracks/{track}/steps").json()["steps"]] == list(range(300))
+    assert max(sizes) <= MOST_AHEAD_BYTES / 60_000 + 2
+    assert [e["number"] for e in served.http.get(f"/v1/tracks/{track}/steps").json()["steps"]] == list(range(600))
 
 
 def test_a_stream_that_is_faster_than_it_may_be_waits(
