@@ -1,9 +1,9 @@
 """Many devices followed at once: how far behind does the server fall?
 
-`python benchmarks/concurrent_tracks.py [tracks] [seconds]` starts `isodyn serve` on a hall of 30 m by 20 m whose field is
-known, and streams steps of a tenth of a second over one WebSocket a track, from one client process on the same machine.
-The lag of a step is from when it was due until the answer that it is stored has come. Then what a step costs without a
-server.
+`python benchmarks/concurrent_tracks.py [tracks] [seconds]` starts `isodyn serve` on a hall of 30 m by 20 m whose field
+is known, and streams a step every tenth of a second over one WebSocket a track, from one client process on the same
+machine. The lag of a step is from when it was due until the answer that it is stored has come. Then what a step costs
+without a server.
 """
 
 import asyncio
