@@ -13,11 +13,11 @@ import asyncio
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import msgspec
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from fastapi.concurrency import run_in_threadpool
 from pydantic import ValidationError
 from sqlalchemy.exc import OperationalError
 
@@ -57,7 +57,8 @@ async def stream(browser: WebSocket, track_id: str) -> None:
     try:
         _check_origin(browser)
         identity = await recognised(context, secret, "locate")
-        frame, ready = await run_in_threadpool(_ready, context, identity, track_id)
+        work = partial(_ready, context, identity, track_id)
+        frame, ready = await asyncio.get_running_loop().run_in_executor(context.follows, work)
     except IsodynError as error:
         await browser.send_denial_response(isodyn_problem(error))
         return
