@@ -313,7 +313,7 @@ def main() -> int:
         source = "" if check.citation == OURS else f" (Shockley, {check.citation})"
         print(f"{check.verdict:12} {check.claim}{source}: {parts}")
     for claim, citation in NEEDS_A_FILTER:
-        print(f"{'-':12} {claim} (Shockley, {citation}): not tested here: needs a filter")
+        print(f"{'-':12} {claim} (Shockley, {citation}): see shockley_tracking.py")
     print(f"\nshare of fixes {', '.join(BINS)}, and availability")
     print("\n".join(figures(study)))
     his = [check.verdict for check in checks if check.citation != OURS]

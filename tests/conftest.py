@@ -12,6 +12,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from sqlalchemy import Engine, create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
@@ -26,6 +27,9 @@ from app.services.artefacts import grid_to_bytes
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
+
+settings.register_profile("untimed", deadline=None)  # how fast a machine is, is no test's business
+settings.load_profile("untimed")
 
 CHROMIUM = Path("/usr/bin/chromium")
 POSTGRES_URL = os.environ.get("ISODYN_TEST_POSTGRES_URL", "postgresql+psycopg://root@127.0.0.1:5432/postgres")

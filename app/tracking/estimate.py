@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.geometry import Array, wrap_angle_rad
-from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Particles, Z, effective_sample_size
+from app.tracking.particle_filter import effective_sample_size
+from app.tracking.particles import COURSE, HEADING, MEASURED, SCALE, Particles, Z
 
-__all__ = ["Estimate", "Spot", "State", "carried_on", "describe", "kld_sample_size", "occupied_bins"]
+__all__ = ["Estimate", "Spot", "State", "carried_on", "describe", "occupied_bins"]
 
 State = Literal["searching", "converged", "lost"]
 
@@ -17,8 +18,6 @@ _MODE_M = 3.0  # particles this near a mode's mean are its own
 _MODES = 5
 _LEAST_MODE = 0.02
 _BIN_M, _BIN_RAD = 0.5, np.pi / 12
-KLD_ERROR, KLD_QUANTILE = 0.05, 2.326
-"""Kullback-Leibler distance from the true posterior that the sample may have, with 99 % probability (Fox 2003)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +65,10 @@ def describe(particles: Particles, weight: Array, floors: int, map_variance_m2: 
     """The estimate of particles of normalised weights; `map_variance_m2` per axis is what places of the map err by."""
     spots = _spots(particles, weight)
     best = spots[0]
-    here = particles.floor == best.floor
-    w = weight[here] / weight[here].sum()
-    rows = particles.rows[here]
+    rows, w = particles.rows, weight
+    if len(spots) > 1 or best.probability < 1.0:
+        here = particles.floor == best.floor
+        rows, w = rows[here], weight[here] / weight[here].sum()
     off = rows[:, :2] - np.array(best.position_m[:2])
     covariance = (w[:, None] * off).T @ off + map_variance_m2 * np.eye(2)
     distance = np.hypot(off[:, 0], off[:, 1])
@@ -116,7 +116,10 @@ def carried_on(estimate: Estimate, moved_m: Array) -> Estimate:
 
 
 def _spots(particles: Particles, weight: Array) -> list[Spot]:
-    """Greedily: the heaviest square metre, then what lies within reach of its mean."""
+    """Greedily: the heaviest square metre, then what lies within reach of its mean. One place alone is seen at once."""
+    alone = _one_spot(particles, weight)
+    if alone is not None:
+        return [alone]
     left = weight.copy()
     key = _keys(particles, 2.0 * _BIN_M)
     spots: list[Spot] = []
@@ -138,6 +141,19 @@ def _spots(particles: Particles, weight: Array) -> list[Spot]:
     return sorted(spots, key=lambda spot: -spot.probability)
 
 
+def _one_spot(particles: Particles, weight: Array) -> Spot | None:
+    """All there is, where it is near its mean on one floor."""
+    floor = int(particles.floor[0])
+    if (particles.floor != floor).any():
+        return None
+    centre = weight @ particles.rows[:, :3]
+    off = particles.rows[:, :2] - centre[:2]
+    if float(np.max(off[:, 0] ** 2 + off[:, 1] ** 2)) > _MODE_M**2:
+        return None
+    heading = float(np.angle(weight @ np.exp(1j * particles.rows[:, HEADING])))
+    return Spot(floor, (float(centre[0]), float(centre[1]), float(centre[2])), heading, 1.0)
+
+
 def _keys(particles: Particles, bin_m: float) -> NDArray[np.int64]:
     """(n,) number of each particle's bin of place."""
     cell = np.floor(particles.rows[:, :2] / bin_m).astype(np.int64)
@@ -151,11 +167,3 @@ def occupied_bins(particles: Particles) -> int:
     place = _keys(particles, _BIN_M)
     heading = np.floor(np.mod(particles.rows[:, HEADING], 2.0 * np.pi) / _BIN_RAD).astype(np.int64)
     return len(np.unique(place * 32 + heading))
-
-
-def kld_sample_size(bins: int, error: float = KLD_ERROR, quantile: float = KLD_QUANTILE) -> float:
-    """Particles that hold the Kullback-Leibler distance below `error`, for a belief over so many bins (Fox 2003)."""
-    if bins <= 1:
-        return 1.0
-    k = bins - 1.0
-    return float(k / (2.0 * error) * (1.0 - 2.0 / (9.0 * k) + np.sqrt(2.0 / (9.0 * k)) * quantile) ** 3)

@@ -16,12 +16,15 @@ RISE_M = 0.5  # risen or sunk: a reading of its own
 
 def moved_on(tracker: Tracker, state: TrackState, step: Step) -> TrackState:
     """Path and course up to this step."""
-    here = np.zeros(3) if step.displacement_m is None else np.asarray(step.displacement_m, dtype=np.float64)
-    before = state.step
-    if before is None or step.displacement_m is None or before.displacement_m is None:
-        unseen_m = 0.0 if before is None else tracker.options.speed_m_s * (step.t_s - before.t_s)
-        return replace(state, path_m=state.path_m + unseen_m, course_from_m=here)
-    path_m = state.path_m + float(np.hypot(*(here - before.displacement_m)[:2]))
+    before, place = state.step, state.place_m
+    if before is None or place is None:
+        here = np.zeros(3) if step.displacement_m is None else np.asarray(step.displacement_m, dtype=np.float64)
+        return replace(state, place_m=here, course_from_m=here)
+    if step.displacement_m is None:
+        unseen_m = tracker.options.speed_m_s * (step.t_s - before.t_s)
+        return replace(state, path_m=state.path_m + unseen_m, unseen_m=state.unseen_m + unseen_m)
+    here = np.asarray(step.displacement_m, dtype=np.float64)
+    path_m = state.path_m + float(np.hypot(*(here - place)[:2]))
     assert state.course_from_m is not None
     way, start = here - state.course_from_m, state.course_from_m
     first, now = state.course_rad
@@ -29,15 +32,18 @@ def moved_on(tracker: Tracker, state: TrackState, step: Step) -> TrackState:
         now = float(np.arctan2(way[1], way[0]))
         first = now if np.isnan(first) else first
         start = start + COURSE_KEPT * way
-    tells_height = state.tells_height or bool(here[2] != before.displacement_m[2])
-    return replace(state, path_m=path_m, course_rad=(first, now), course_from_m=start, tells_height=tells_height)
+    return replace(
+        state, path_m=path_m, place_m=here, course_rad=(first, now), course_from_m=start,
+        tells_height=state.tells_height or bool(here[2] != place[2]),
+    )  # fmt: skip
 
 
 def gathered(tracker: Tracker, state: TrackState, step: Step) -> tuple[Reading | None, TrackState]:
     """The samples since the last reading as a new one, once the device is far enough from it."""
     if step.B_uT is None:
         return None, state
-    place = np.zeros(3) if step.displacement_m is None else step.displacement_m
+    place = state.place_m
+    assert place is not None
     told = np.concatenate([place, [step.t_s], step.B_uT])
     total = told if state.gathered is None else state.gathered + told
     count = state.samples + 1
@@ -51,10 +57,7 @@ def gathered(tracker: Tracker, state: TrackState, step: Step) -> tuple[Reading |
         if near and turned < tracker.options.update_rad:
             return None, replace(state, samples=count, gathered=total)
     mean = total / count
-    unseen_m = 0.0
-    if step.displacement_m is None and state.recent.readings:
-        unseen_m = state.path_m - state.recent.path_m[-1]
     reading = Reading(
-        step.number, float(mean[3]), mean[4:], count, mean[:3], float(yaw_rad), step.device_to_frame, unseen_m
+        step.number, float(mean[3]), mean[4:], count, mean[:3], float(yaw_rad), step.device_to_frame, state.unseen_m
     )
-    return reading, replace(state, samples=0, gathered=None)
+    return reading, replace(state, samples=0, gathered=None, unseen_m=0.0)

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from app.geometry import Array
 from app.tracking.ground import Barriers
+from app.tracking.particle_filter import normalise, systematic_ancestors
 from app.tracking.places import Places
 
 __all__ = [
     "COLUMNS", "COURSE", "DRAWS", "DRIFT", "HEADING", "MEASURED", "SCALE", "X", "Y", "Z", "Advance", "Particles",
-    "advance", "effective_sample_size", "log_evidence", "new_particles", "resample", "weights",
+    "advance", "log_evidence", "new_particles", "resample", "weights",
 ]  # fmt: skip
 
 X, Y, Z, HEADING, COURSE, SCALE, DRIFT, MEASURED = 0, 1, 2, 3, 4, 5, 6, 7
@@ -130,7 +131,7 @@ def _advance(  # type: ignore[no-untyped-def]
         variance, measured = _look_up(x, y, row[Z], floor[i], cells, planes, shapes, floors, resolution, c, mean)
         row[MEASURED] = forget * row[MEASURED] + (1.0 - forget) * measured
         sigma = np.sqrt(errors[0] * variance)
-        spread = errors[3] * np.sqrt(1.0 - measured)
+        spread = errors[3] * np.sqrt(max(1.0 - measured, 0.0))
         white = errors[1] * variance + noise_uT2
         bb, bv, bf = row[_BB], fade_v * row[_BV], fade_f * row[_BF]
         vv, vf = fade_v * fade_v * row[_VV] + 1.0 - fade_v * fade_v, fade_v * fade_f * row[_VF]
@@ -229,28 +230,19 @@ def _crosses(x0, y0, x1, y1, floor, barriers):  # type: ignore[no-untyped-def]
 
 def weights(particles: Particles) -> Array:
     """(n,) normalised."""
-    w = np.exp(particles.log_weight - particles.log_weight.max())
-    return np.asarray(w / w.sum())
+    return normalise(particles.log_weight).weight
 
 
 def log_evidence(particles: Particles) -> float:
     """Log of the sum of the weights."""
-    peak = float(particles.log_weight.max())
-    return peak + float(np.log(np.exp(particles.log_weight - peak).sum()))
-
-
-def effective_sample_size(weight: Array) -> float:
-    """1 / sum w^2 (Kuevor, eq. 4.10), of normalised weights."""
-    return float(1.0 / np.sum(np.square(weight)))
+    return normalise(particles.log_weight).log_sum
 
 
 def resample(particles: Particles, weight: Array, count: int, draw: float) -> tuple[Particles, NDArray[np.int64]]:
-    """Systematic resampling with one uniform draw (Kuevor, L1565): `count` particles of one weight, together as
+    """Systematic resampling with one uniform draw: `count` particles of one weight, together as heavy as the old ones;
 
-    heavy as the old ones; and from which each was drawn.
+    and from which each was drawn.
     """
-    edges = np.cumsum(weight)
-    chosen = np.searchsorted(edges, (draw + np.arange(count)) / count * edges[-1], side="right")
-    chosen = np.minimum(chosen, len(weight) - 1)
+    chosen = systematic_ancestors(weight, draw, count)
     even = np.full(count, log_evidence(particles) - np.log(count))
     return replace(particles, rows=particles.rows[chosen], floor=particles.floor[chosen], log_weight=even), chosen

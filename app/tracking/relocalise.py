@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.tracking.estimate import describe, occupied_bins
+from app.tracking.estimate import occupied_bins
 from app.tracking.moves import window_moves
 from app.tracking.particles import Particles, log_evidence, resample, weights
 from app.tracking.resampling import enough
@@ -32,8 +32,7 @@ def search(tracker: Tracker, state: TrackState, rng: np.random.Generator) -> Tra
     if occupied_bins(resample(found.particles, weight, len(weight), 0.5)[0]) > ENOUGH_BINS and (
         state.path_m < options.window_m
     ):
-        estimate = describe(found.particles, weight, tracker.places.count, tracker.places.structure.position_sd_m**2)
-        return replace(state, estimate=estimate)
+        return replace(state, estimate=tracker.describe(found.particles, weight))
     return _taken(tracker, state, found, rng)
 
 
@@ -54,14 +53,19 @@ def _taken(tracker: Tracker, state: TrackState, found: Found, rng: np.random.Gen
         Node(reading.number, reading.t_s, path_m)
         for reading, path_m in zip(state.recent.readings, state.recent.path_m, strict=True)
     )
-    return replace(state, particles=particles, lag=along(nodes, found.history_m[:, chosen], particles))
+    lag = along(nodes, found.history_m[:, chosen], particles)
+    estimate = tracker.describe(found.particles, weight)
+    gains = ((state.path_m, found.log_ratio),)
+    return replace(state, particles=particles, lag=lag, gains=gains, estimate=estimate)
 
 
 def doubtful(tracker: Tracker, state: TrackState) -> bool:
-    """Whether it is time to look elsewhere."""
+    """Whether it is time to look elsewhere. A window needs to know how it was walked."""
     walked = state.path_m - state.searched_m
+    reckoned = not any(reading.unseen_m for reading in state.recent.readings)
     return (
-        walked >= SEARCH_AGAIN_M
+        reckoned
+        and walked >= SEARCH_AGAIN_M
         and state.recent.length_m > LONG_ENOUGH * tracker.options.window_m
         and state.probability < DOUBT
     )
@@ -85,10 +89,10 @@ def search_again(tracker: Tracker, state: TrackState, rng: np.random.Generator) 
     taken = _taken(tracker, state, found, rng)
     assert taken.particles is not None
     assert taken.lag is not None
-    return _mixed(state, taken, elsewhere)
+    return _mixed(tracker, state, taken, elsewhere)
 
 
-def _mixed(state: TrackState, taken: TrackState, elsewhere: float) -> TrackState:
+def _mixed(tracker: Tracker, state: TrackState, taken: TrackState, elsewhere: float) -> TrackState:
     """Both sets of particles, weighing as likely as they are."""
     assert state.particles is not None
     assert taken.particles is not None
@@ -107,4 +111,5 @@ def _mixed(state: TrackState, taken: TrackState, elsewhere: float) -> TrackState
         np.concatenate([state.lag.position_m[mine], taken.lag.position_m[theirs]], axis=1),
         np.concatenate([state.lag.floor[mine], taken.lag.floor[theirs]], axis=1),
     )
-    return replace(state, particles=particles, lag=lag)
+    estimate = tracker.describe(particles, weights(particles))
+    return replace(state, particles=particles, lag=lag, estimate=estimate)

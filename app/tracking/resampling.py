@@ -3,8 +3,9 @@
 import numpy as np
 
 from app.geometry import Array
-from app.tracking.estimate import kld_sample_size, occupied_bins
+from app.tracking.estimate import occupied_bins
 from app.tracking.options import TrackOptions
+from app.tracking.particle_filter import kld_sample_size
 from app.tracking.particles import Particles
 
 __all__ = ["enough"]

@@ -5,7 +5,7 @@ exactly: each is carried along its own course through the whole window, with the
 start out knowing the sensor's offset.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,7 @@ from app.tracking.particles import (
 from app.tracking.places import Places
 from app.tracking.step import Step
 
-__all__ = ["Found", "find", "spread"]
+__all__ = ["Found", "find", "spread", "walkable_cells"]
 
 _STILL = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
 
@@ -61,7 +61,7 @@ def find(
     """Search all floors for a window whose readings are `moves`. Raises InvalidInput where nothing is walkable."""
     asked = LocateOptions(
         bias_sd_uT=options.bias_sd_uT, step_scale_sd=options.step_scale_sd,
-        heading_drift_sd_rad_per_m=options.heading_drift_sd_rad_per_m, walkable=_walkable(options.ground),
+        heading_drift_sd_rad_per_m=options.heading_drift_sd_rad_per_m, walkable=walkable_cells(options.ground),
     )  # fmt: skip
     matched = match(window, floors, places.components, "raw", prior, asked)
     drawn, proposed = _draw(matched, places, window.frame, count, rng)
@@ -184,7 +184,11 @@ def _only(particles: Particles, kept: NDArray[np.bool_]) -> Particles:
     return Particles(particles.rows[kept], particles.floor[kept], particles.log_weight[kept])
 
 
-def _walkable(ground: Ground | None):  # type: ignore[no-untyped-def]
+Inside = Callable[[str, Array, Array], NDArray[np.bool_]]
+
+
+def walkable_cells(ground: Ground | None) -> Inside | None:
+    """(floor id, x_m (nx,), y_m (ny,)) -> (ny, nx) where one can walk, as the search asks; None: anywhere."""
     if ground is None or not ground.walkable:
         return None
 

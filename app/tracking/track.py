@@ -19,36 +19,34 @@ from app.errors import Fault, InvalidInput
 from app.positioning.features import common_components
 from app.positioning.floors import SearchableFloor, reduce_floor, shared_noise_sd_uT
 from app.positioning.window import WindowFrame
-from app.tracking.estimate import Estimate, carried_on, describe
+from app.tracking.estimate import Estimate, carried_on
 from app.tracking.gather import gathered, moved_on
 from app.tracking.ground import barriers_of
 from app.tracking.moves import move_between, offset_variance_uT2
 from app.tracking.no_map import predict_without_map, without_map
 from app.tracking.options import StartPrior, TrackOptions
+from app.tracking.particle_filter import needs_resampling, normalise
 from app.tracking.particles import (
     DRAWS,
     Advance,
     Particles,
     advance,
-    effective_sample_size,
-    log_evidence,
     resample,
-    weights,
 )
 from app.tracking.places import make_places
 from app.tracking.recent import Reading, Recent
 from app.tracking.relocalise import doubtful, search, search_again
 from app.tracking.resampling import enough
 from app.tracking.smoother import Node, Smoothed, empty_lag, inherit, remember, settle
-from app.tracking.start import spread
+from app.tracking.start import spread, walkable_cells
 from app.tracking.step import Step
 from app.tracking.storeys import settle_heights, through_connectors
 from app.tracking.track_state import MOST_ODDS, Tracker, TrackState
 
 __all__ = ["Followed", "TrackState", "Tracker", "begin", "follow", "make_tracker"]
 
+MAPPED = 0.5  # of the last metres, for a claim
 STOREY_M = 1.5  # risen or sunk: another floor
-RESAMPLE_BELOW = 0.75  # of the particles (Kuevor, L1565)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +68,8 @@ def make_tracker(
     seed: int,
     prior: StartPrior | None = None,
 ) -> Tracker:
-    """Raises InvalidInput without floors, IncompatibleFrames where a map cannot answer the frame."""
+    """Raises InvalidInput without floors or where no cell of theirs can be walked on, IncompatibleFrames where a map
+    cannot answer the frame."""
     if not floors:
         reason = "none of the floors has a map to be followed on; upload surveys and build one"
         raise InvalidInput(reason, Fault("/floor_ids", reason))
@@ -78,9 +77,24 @@ def make_tracker(
     noise_sd_uT = shared_noise_sd_uT([floor.grid for floor in floors])
     ready = tuple(reduce_floor(floor, shared, noise_sd_uT) for floor in floors)
     walls = {} if options.ground is None else options.ground.walls
+    _check_walkable(ready, options)
     return Tracker(
         ready, make_places(ready), barriers_of(walls, [floor.floor_id for floor in ready]), frame, options, seed, prior
     )
+
+
+def _check_walkable(floors: Sequence[SearchableFloor], options: TrackOptions) -> None:
+    walkable = walkable_cells(options.ground)
+    if walkable is None:
+        return
+    for floor in floors:
+        for plane in floor.planes:
+            ny, nx = plane.shape
+            x, y = (np.asarray(plane.origin_m[k] + plane.resolution_m * np.arange(n)) for k, n in ((0, nx), (1, ny)))
+            if walkable(floor.floor_id, x, y).any():
+                return
+    reason = "no cell of the maps lies in the walkable area: check its coordinates, metres in the building frame"
+    raise InvalidInput(reason, Fault("/options/walkable", reason))
 
 
 def begin() -> TrackState:
@@ -95,32 +109,34 @@ def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
     reading, state = gathered(tracker, state, step)
     if reading is None:
         return _followed(replace(state, step=step), ())
-    before = state.recent.readings[-1] if state.recent.readings else None
-    recent = state.recent
+    said, recent = state.estimate, state.recent
+    before = recent.readings[-1] if recent.readings else None
     if before is not None and abs(reading.displacement_m[2] - recent.readings[0].displacement_m[2]) > STOREY_M:
         recent = Recent()  # a window is walked on one floor
     recent = recent.with_reading(reading, state.path_m, tracker.options.window_m)
     state = replace(state, step=step, recent=recent)
     state = _predict_nothing(tracker, state, before, reading)
     if state.particles is None:
+        settled: tuple[Smoothed, ...] = ()
         if before is None and (tracker.prior is not None or step.displacement_m is None):
             state = _start_around(tracker, state, step, rng)
-            settled: tuple[Smoothed, ...] = ()
             state, settled = _weigh(tracker, state, None, reading, rng)
         else:
-            state, settled = search(tracker, state, rng), ()
+            state = search(tracker, state, rng)
     else:
         state, settled = _weigh(tracker, state, before, reading, rng)
         if doubtful(tracker, state):
             state = search_again(tracker, state, rng)
+    if state.estimate is not said:
+        state = replace(state, estimate_from_m=reading.displacement_m)
     return _followed(_judged(tracker, state), settled)
 
 
 def _followed(state: TrackState, settled: tuple[Smoothed, ...]) -> Followed:
     """The belief, carried on to where the device is by now from where it was last compared with the map."""
-    estimate, step = state.estimate, state.step
-    if estimate is not None and step is not None and step.displacement_m is not None:
-        estimate = carried_on(estimate, step.displacement_m - state.recent.readings[-1].displacement_m)
+    estimate = state.estimate
+    if estimate is not None and state.place_m is not None and state.estimate_from_m is not None:
+        estimate = carried_on(estimate, state.place_m - state.estimate_from_m)
     return Followed(state, estimate, state.probability, settled)
 
 
@@ -159,21 +175,21 @@ def _weigh(
     options = tracker.options
     move = move_between(before, reading, tracker.frame, tracker.places, options)
     noise = rng.standard_normal((len(state.particles), DRAWS), dtype=np.float32)
-    evidence = log_evidence(state.particles)
     particles = advance(state.particles, move, tracker.places, tracker.barriers, noise)
-    gained = log_evidence(particles) - evidence
+    weight, gained, _ = normalise(particles.log_weight)
+    particles = replace(particles, log_weight=particles.log_weight - gained)
     particles = _on_floors(tracker, state, particles, before, reading, move, rng)
     walked, lost = state.gains[-1]
     gains = (*state.gains[:-1], (walked, lost + gained))
     log_odds = min(state.log_odds + lost + gained, MOST_ODDS)
     lag = remember(state.lag, Node(reading.number, reading.t_s, state.path_m), particles)
-    weight = weights(particles)
     lag, settled = settle(lag, weight, state.path_m - options.lag_m)
-    if effective_sample_size(weight) < RESAMPLE_BELOW * len(particles):
+    estimate = tracker.describe(particles, weight)
+    if needs_resampling(weight):
         count = enough(particles, weight, options)
         particles, chosen = resample(particles, weight, count, float(rng.uniform()))
         lag = inherit(lag, chosen)
-    return replace(state, particles=particles, lag=lag, gains=gains, log_odds=log_odds), settled
+    return replace(state, particles=particles, lag=lag, gains=gains, log_odds=log_odds, estimate=estimate), settled
 
 
 def _on_floors(
@@ -192,21 +208,16 @@ def _on_floors(
 
 def _judged(tracker: Tracker, state: TrackState) -> TrackState:
     """The belief in words."""
-    if state.particles is None:
+    options, estimate = tracker.options, state.estimate
+    if state.particles is None or estimate is None:
         return state
-    options, structure = tracker.options, tracker.places.structure
-    weight = weights(state.particles)
-    estimate = describe(state.particles, weight, tracker.places.count, structure.position_sd_m**2)
     sure = state.probability * estimate.concentration
-    own_radius_m = float(np.sqrt(max(estimate.radius_95_m**2 - (2.45 * structure.position_sd_m) ** 2, 0.0)))
-    state = replace(state, estimate=estimate)
-    if sure >= options.converged_probability and own_radius_m <= options.converged_radius_m:
+    map_m = 2.45 * tracker.places.structure.position_sd_m  # what the radius owes to the map's own places
+    radius_m = float(np.sqrt(max(estimate.radius_95_m**2 - map_m**2, 0.0)))
+    mapped = estimate.measured >= MAPPED
+    if sure >= options.converged_probability and radius_m <= options.converged_radius_m and mapped:
         at_m = state.path_m if state.converged_at_m is None else state.converged_at_m
         return replace(state, state="converged", converged_at_m=at_m)
-    if (
-        state.state == "converged"
-        and sure >= options.lost_probability
-        and own_radius_m <= 2 * options.converged_radius_m
-    ):
+    if state.state == "converged" and sure >= options.lost_probability and radius_m <= 2.0 * options.converged_radius_m:
         return state
     return replace(state, state="searching" if state.converged_at_m is None else "lost")

@@ -8,7 +8,7 @@ from scipy.special import expit
 from app.geometry import Array
 from app.positioning.floors import SearchableFloor
 from app.positioning.window import WindowFrame
-from app.tracking.estimate import Estimate, State
+from app.tracking.estimate import Estimate, State, describe
 from app.tracking.ground import Barriers
 from app.tracking.no_map import NoMap
 from app.tracking.options import StartPrior, TrackOptions
@@ -40,6 +40,10 @@ class Tracker:
         """Of readings: nearer ones meet the same cell of the map."""
         return max(self.options.update_m, float(self.places.resolution_m.min()))
 
+    def describe(self, particles: Particles, weight: Array) -> Estimate:
+        """The estimate of particles of normalised weights."""
+        return describe(particles, weight, self.places.count, self.places.structure.position_sd_m**2)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackState:
@@ -47,18 +51,23 @@ class TrackState:
 
     step            the last one followed
     samples         since the last reading: how many, and in `gathered` the sums of their place, time and field
+    place_m         (3,) where the device last reckoned to be
+    unseen_m        that it may have walked since the last reading without knowing how
     course_rad      (2,) direction of the path at its start and now, in the track's frame; NaN: not known yet
     particles       None while they are searched for
     log_odds        how much better the particles predict the readings than no map does, kept to MOST_ODDS
     gains           (k, 2) distance walked and log odds gained, of the readings in `recent`
     searched_m      path at the last search
     tells_height    whether the device ever said that it rose or sank
+    estimate_from_m (3,) where the device reckoned to be when the estimate was made
     """
 
     step: Step | None = None
     samples: int = 0
     gathered: Array | None = None
     path_m: float = 0.0
+    place_m: Array | None = None
+    unseen_m: float = 0.0
     course_rad: tuple[float, float] = (np.nan, np.nan)
     course_from_m: Array | None = None
     recent: Recent = field(default_factory=Recent)
@@ -71,6 +80,7 @@ class TrackState:
     tells_height: bool = False
     state: State = "searching"
     estimate: Estimate | None = None
+    estimate_from_m: Array | None = None
     converged_at_m: float | None = None
 
     @property

@@ -82,17 +82,18 @@ def wandering(rng: np.random.Generator, length_m: float, inside_m: float = 15.0,
     n = int(length_m / spacing_m)
     while True:
         course = rng.uniform(-np.pi, np.pi) + np.cumsum(gaussian_filter(rng.normal(size=n), 8.0)) * 0.35
-        path = rng.uniform(3.0, inside_m - 3.0, 2) + np.cumsum(spacing_m * np.column_stack([np.cos(course), np.sin(course)]), 0)
+        way = spacing_m * np.column_stack([np.cos(course), np.sin(course)])
+        path = rng.uniform(3.0, inside_m - 3.0, 2) + np.cumsum(way, axis=0)
         if (path > 1.0).all() and (path < inside_m - 1.0).all():
             return np.asarray(path)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def grid_of() -> Callable[..., FieldGrid]:
     return make_grid
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def floor_of() -> Callable[..., SearchableFloor]:
     def make(rng: np.random.Generator, floor_id: str = "ground", **about: object) -> SearchableFloor:
         return prepare_floor(floor_id, make_grid(rng, **about))  # type: ignore[arg-type]
@@ -100,11 +101,11 @@ def floor_of() -> Callable[..., SearchableFloor]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def carried_over() -> Callable[..., Carried]:
     return carry
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def path_of() -> Callable[..., Array]:
     return wandering

@@ -14,6 +14,7 @@ from app.geometry import yaw_matrix
 from app.positioning.floors import SearchableFloor
 from app.positioning.window_error import weigh_residuals, window_error
 from app.tracking.ground import barriers_of
+from app.tracking.particle_filter import effective_sample_size
 from app.tracking.particles import (
     DRAWS,
     HEADING,
@@ -22,7 +23,6 @@ from app.tracking.particles import (
     Advance,
     Particles,
     advance,
-    effective_sample_size,
     log_evidence,
     new_particles,
     resample,
@@ -228,6 +228,7 @@ def replaced_floor() -> Places:
         empty = np.zeros(0)
         _floors.append(Places(
             "vector", np.ones(3), np.zeros(5, dtype=np.float32), np.zeros((1, 3)), np.array([[0, 1, 1]]),
-            np.array([[0, 1]]), np.ones(1), np.ones(1), np.ones(1), np.ones(1), np.ones(5), empty, empty, 1.0, STRUCTURE,
+            np.array([[0, 1]]), np.ones(1), np.ones(1), np.ones(1), np.ones(1), np.ones(5), empty, empty, 1.0,
+            STRUCTURE,
         ))  # fmt: skip
     return _floors[0]
