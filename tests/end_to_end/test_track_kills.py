@@ -40,13 +40,13 @@ async def stream_until_killed(server: Any, track: str, steps: Steps, kill_at: in
     the stream began, and the last one acknowledged."""
     headers = {"Authorization": server.http.headers["authorization"]}
     url = f"ws://127.0.0.1:{server.port}/v1/tracks/{track}/stream"
-    acknowledged = -1
-    async with connect(url, additional_headers=headers, proxy=None) as stream:
+    acknowledged, most = -1, kill_at + 40
+    async with connect(url, additional_headers=headers, proxy=None, open_timeout=60) as stream:
         first = json.loads(await stream.recv())["next_step"]
 
         async def send() -> None:
             with suppress(ConnectionClosed):
-                for step in steps[first:]:
+                for step in steps[first:most]:  # so that the kill comes before the end
                     await stream.send(json.dumps({"type": "step", **step}))
                     await asyncio.sleep(0.01)
 
