@@ -8,6 +8,7 @@
     * NotFound                  no such object, or it belongs to somebody else              (HTTP 404)
     * Conflict                  the object's present state forbids it                       (HTTP 409)
     * TooLarge                  more bytes or samples than the limit                        (HTTP 413)
+    * TooMany                   more requests or tracks than the limit, for now             (HTTP 429)
     * JobCancelled              a job was asked to stop, and did
     * CorruptArtefact           stored bytes do not match their hash or their format
 
@@ -27,6 +28,7 @@ __all__ = [
     "JobCancelled",
     "NotFound",
     "TooLarge",
+    "TooMany",
     "UnreadableSurvey",
 ]
 
@@ -73,6 +75,14 @@ class Conflict(IsodynError):
 
 class TooLarge(IsodynError):
     """More bytes or samples than the limit."""
+
+
+class TooMany(IsodynError):
+    """More than the limit, for now; `retry_after_s` says when it may do, where that is known."""
+
+    def __init__(self, message: str, *faults: Fault, retry_after_s: float | None = None) -> None:
+        super().__init__(message, *faults)
+        self.retry_after_s = retry_after_s
 
 
 class JobCancelled(IsodynError):

@@ -1,6 +1,8 @@
 """The composition root of the web process: settings in, one FastAPI application out."""
 
+import asyncio
 import gc
+import logging
 import os
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
@@ -10,10 +12,25 @@ from threading import Thread
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
+from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
 
 from app import __version__
-from app.api import buildings, floors, health, jobs, localizability, locate, maps, outlines, plans, replay, surveys
+from app.api import (
+    buildings,
+    floors,
+    health,
+    jobs,
+    localizability,
+    locate,
+    maps,
+    outlines,
+    plans,
+    replay,
+    surveys,
+    track_stream,
+    tracks,
+)
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.metrics import Metrics, MetricsMiddleware
@@ -22,13 +39,19 @@ from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
 from app.positioning.locate import warm_up
+from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing, ensure_admin_key
+from app.services.follow_warm_up import warm_up_tracks
+from app.services.step_rate import StepRate
+from app.services.track_spec import Trackers
 from app.settings import Settings
 from app.viewer.database_source import DatabaseViewerSource
 from app.viewer.page import ViewerApp
 
 __all__ = ["create_app", "first_start", "open_context"]
+
+_log = logging.getLogger(__name__)
 
 DESCRIPTION = """Magnetic maps of buildings: upload walks, get a field map per floor, locate a window of
 magnetometer samples. Lengths are metres, field microtesla, angles radians, times UTC; every estimate says how sure it
@@ -57,16 +80,28 @@ def open_context(settings: Settings) -> Context:
     engine = create_database_engine(settings.resolved_database_url)
     blobs = open_blob_store(settings.resolved_blob_url)
     sessions = session_factory(engine)
+    grids = GridCache(blobs, settings.grid_cache_bytes)
+    follows = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
     return Context(
         settings=settings,
         engine=engine,
         sessions=sessions,
         blobs=blobs,
         queue=JobQueue(engine),
-        grids=GridCache(blobs, settings.grid_cache_bytes),
+        grids=grids,
         metrics=Metrics(),
         keys=KeyRing(sessions),
         searches=ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
+        follows=follows,
+        follower=Follower(
+            engine,
+            sessions,
+            Trackers(grids),
+            follows,
+            idle_timeout_s=settings.track_idle_timeout_s,
+            capacity_bytes=settings.track_cache_bytes,
+        ),
+        step_rate=StepRate(settings.max_track_steps_per_s),
     )
 
 
@@ -78,8 +113,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         Thread(target=_get_ready, name="warm-up", daemon=True).start()
+        sweep = asyncio.create_task(_end_idle_tracks(context))
         yield
+        sweep.cancel()
         await viewer.close()
+        await run_in_threadpool(context.follower.close)
         await run_in_threadpool(context.queue.close)
         context.engine.dispose()
 
@@ -88,7 +126,21 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                   redirect_slashes=False)  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
-    for part in (locate, health, buildings, floors, outlines, plans, surveys, maps, localizability, replay, jobs):
+    for part in (
+        locate,
+        tracks,
+        track_stream,
+        health,
+        buildings,
+        floors,
+        outlines,
+        plans,
+        surveys,
+        maps,
+        localizability,
+        replay,
+        jobs,
+    ):
         app.include_router(part.router)
     for path in ("/", "/view"):
         app.add_api_route(path, _to_the_page, include_in_schema=False)
@@ -101,6 +153,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
+async def _end_idle_tracks(context: Context) -> None:
+    """Now and then, as long as the process runs. Whoever asks meanwhile is told by the time, not by this."""
+    while True:
+        await asyncio.sleep(min(60.0, max(context.settings.track_idle_timeout_s / 4.0, 1.0)))
+        try:
+            await run_in_threadpool(context.follower.end_idle)
+        except SQLAlchemyError as error:
+            _log.warning("idle tracks were not ended, which is tried again: %s", error)
+
+
 def _get_ready() -> None:
     """Warm up, then let the garbage collector forget all that is there by now.
 
@@ -108,6 +170,7 @@ def _get_ready() -> None:
     every thread for more than 0.1 s, and a busy server would do so about once a second.
     """
     warm_up()
+    warm_up_tracks()
     gc.collect()
     gc.freeze()
 

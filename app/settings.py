@@ -27,6 +27,14 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(default=4 * 2**20, description="largest JSON body")
     max_window_samples: int = Field(default=2000, ge=1, le=20_000, description="most samples in one window")
     grid_cache_bytes: int = Field(default=512 * 2**20, description="memory for maps held ready to answer")
+    track_idle_timeout_s: float = Field(
+        default=600.0, gt=0, le=86_400, description="a track ends when no step came for this long"
+    )
+    max_tracks_per_key: int = Field(default=200, ge=1, description="most active tracks of one key")
+    max_track_steps_per_s: float = Field(
+        default=200.0, gt=0, description="most steps of one track a second, sustained; a minute of them at once"
+    )
+    track_cache_bytes: int = Field(default=512 * 2**20, description="memory for the states of tracks in use")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
 
     @property

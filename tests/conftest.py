@@ -5,19 +5,24 @@ skipped, but never silently where `CI` is set: there a missing server is a failu
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+import numpy as np
 import pytest
 from sqlalchemy import Engine, create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 from threadpoolctl import threadpool_limits
 
-from app.blobs import FolderBlobStore
+from app.blobs import BlobStore, FolderBlobStore
 from app.db.engine import create_database_engine, migrate, session_factory
+from app.db.tables import Building, Floor, Map, Organisation
+from app.field.error_structure import ErrorStructure
+from app.field.grid import FieldGrid
+from app.services.artefacts import grid_to_bytes
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -32,6 +37,98 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if item.get_closest_marker("browser"):
                 item.add_marker(pytest.mark.skip(reason=f"no browser at {CHROMIUM}: apt-get install chromium"))
+
+
+HALL_CORNERS_M = np.array([[1.0, 1.0], [10.5, 6.5], [10.5, 2.0], [2.0, 5.5], [9.0, 1.0], [2.0, 2.0], [10.0, 7.0]])
+
+
+def hall_uT(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The field of a hall of 12 m by 8 m, known everywhere: (n, 3)."""
+    return np.stack(
+        [
+            18 + 6 * np.sin(0.9 * x + 0.3) * np.cos(0.7 * y),
+            3 + 5 * np.cos(0.6 * x - 0.8 * y),
+            -42 + 6 * np.sin(0.5 * x + 1.1 * y),
+        ],
+        axis=-1,
+    )
+
+
+@pytest.fixture(scope="session")
+def hall_grid() -> FieldGrid:
+    """Its map, as good as a map can be, and 3 m more on every side."""
+    x, y = np.meshgrid(np.arange(-3.0, 15.01, 0.25), np.arange(-3.0, 11.01, 0.25))
+    mean = hall_uT(x, y)[None]
+    gradient = np.stack([np.gradient(mean, 0.25, axis=2), np.gradient(mean, 0.25, axis=1)], axis=-1)
+    return FieldGrid(
+        "vector", (-3.0, -3.0), 0.25, np.array([1.2]), mean.astype(np.float32), np.full(mean.shape, 0.3, np.float32),
+        gradient.astype(np.float32), np.ones(mean.shape[:3], dtype=np.bool_), np.array([18.0, 3.0, -42.0]),
+        np.full(3, 5.0), np.full(3, 0.4), 0.0, ErrorStructure(0.0, 0.0, 1.0, 1.0),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def put_hall(hall_grid: FieldGrid) -> Callable[[Session, BlobStore], tuple[str, str]]:
+    """Put the hall and its active map into a database: ids of building and floor, of the organisation "default"."""
+
+    def put(session: Session, blobs: BlobStore) -> tuple[str, str]:
+        owner = session.query(Organisation).filter_by(name="default").one().id
+        building = Building(organisation_id=owner, name="Hall")
+        session.add(building)
+        session.flush()
+        floor = Floor(organisation_id=owner, building_id=building.id, name="Ground", ordinal=0, elevation_m=0.0)
+        session.add(floor)
+        session.flush()
+        made = Map(
+            organisation_id=owner, floor_id=floor.id, status="ready", spec={}, survey_ids=[], components="vector",
+            grid_sha256=blobs.put(grid_to_bytes(hall_grid)),
+        )  # fmt: skip
+        session.add(made)
+        session.flush()
+        floor.active_map_id = made.id
+        return building.id, floor.id
+
+    return put
+
+
+@pytest.fixture(scope="session")
+def hall_steps() -> Callable[..., list[dict[str, Any]]]:
+    """Steps of a device carried through the hall, ten a second and metre, as a client sends them."""
+    corners = HALL_CORNERS_M
+    turn = 0.7  # of the level frame
+
+    def make(frame: str = "level", count: int = 300, seed: int = 5) -> list[dict[str, Any]]:
+        legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+        at = 0.1 * np.arange(count)
+        p = np.stack([np.interp(at, np.concatenate([[0], np.cumsum(legs)]), corners[:, k]) for k in (0, 1)], axis=1)
+        B = hall_uT(p[:, 0], p[:, 1]) + np.random.default_rng(seed).normal(0.0, 0.3, (count, 3))
+        level = frame in ("level", "norm")
+        c, s = (np.cos(turn), np.sin(turn)) if level else (1.0, 0.0)
+        back = np.array([[c, -s], [s, c]])
+        moved = (p - p[0]) @ back
+        heading = np.unwrap(np.arctan2(np.gradient(p[:, 1]), np.gradient(p[:, 0])))
+        yaw = heading if frame == "body" else np.zeros(count)
+        cy, sy = np.cos(yaw), np.sin(yaw)
+        flat = B[:, :2] @ back
+        told = np.column_stack([cy * flat[:, 0] + sy * flat[:, 1], cy * flat[:, 1] - sy * flat[:, 0], B[:, 2]])
+        more = [{"yaw_rad": float(h - heading[0])} for h in heading]
+        if frame == "body":
+            more = [{"orientation": [float(np.cos(h / 2)), 0.0, 0.0, float(np.sin(h / 2))]} for h in heading]
+        return [
+            {"number": k, "t_s": float(at[k]), "displacement_m": [*moved[k].tolist(), 0.0],
+             "b_ut": float(np.linalg.norm(told[k])) if frame == "norm" else told[k].tolist(), **more[k]}
+            for k in range(count)
+        ]  # fmt: skip
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def hall_place_m() -> Callable[[int], np.ndarray]:
+    """Where the device truly was at a step of `hall_steps`: (2,)."""
+    corners = HALL_CORNERS_M
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    return lambda step: np.array([np.interp(0.1 * step, along, corners[:, k]) for k in (0, 1)])
 
 
 @pytest.fixture(scope="session")

@@ -11,18 +11,20 @@ from app.api.context import Context, context_of
 from app.api.problems import Forbidden, Unauthorised
 from app.services.manage_keys import Identity
 
-__all__ = ["AdminOnly", "Identity", "Locating", "Reading", "SurveyReading", "SurveyWriting", "MapWriting"]
+__all__ = ["AdminOnly", "Identity", "Locating", "Reading", "SurveyReading", "SurveyWriting", "MapWriting", "recognised"]
 
 _bearer = HTTPBearer(auto_error=False, description="an API key, `isd_...`; `isodyn keys create` makes one")
 
 
-async def _identity(context: Context, credentials: HTTPAuthorizationCredentials | None) -> Identity:
-    if credentials is None:
+async def recognised(context: Context, secret: str | None, *any_of: str) -> Identity:
+    """Whose key this is. Raises Unauthorised, and Forbidden where it has none of the scopes that are asked for."""
+    if secret is None:
         raise Unauthorised("send your key as `Authorization: Bearer isd_...`")
-    secret = credentials.credentials
     identity = context.keys.recent(secret) or await run_in_threadpool(context.keys.recognise, secret)
     if identity is None:
         raise Unauthorised("this key is not known or was revoked; `isodyn keys create` makes a new one")
+    if any_of and not identity.may(*any_of):
+        raise Forbidden(f"this needs a key with scope {' or '.join(any_of)}")
     return identity
 
 
@@ -31,10 +33,8 @@ def _needs(*any_of: str) -> Callable[..., Awaitable[Identity]]:
     async def check(
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
     ) -> Identity:
-        identity = await _identity(await context_of(request), credentials)
-        if not identity.may(*any_of):
-            raise Forbidden(f"this needs a key with scope {' or '.join(any_of)}")
-        return identity
+        secret = None if credentials is None else credentials.credentials
+        return await recognised(await context_of(request), secret, *any_of)
 
     return check
 

@@ -13,8 +13,10 @@ from sqlalchemy.orm import Session, sessionmaker
 from app.api.metrics import Metrics
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
+from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing
+from app.services.step_rate import StepRate
 from app.settings import Settings
 
 __all__ = ["Context", "ContextDep", "context_of"]
@@ -24,7 +26,8 @@ __all__ = ["Context", "ContextDep", "context_of"]
 class Context:
     """The open handles of a web process.
 
-    `searches` runs the searches for positions: few at once, the others wait in order of arrival.
+    `searches` runs the searches for positions: few at once, the others wait in order of arrival. `follows` is
+    the same for tracks.
     """
 
     settings: Settings
@@ -36,6 +39,9 @@ class Context:
     metrics: Metrics
     keys: KeyRing
     searches: Executor
+    follows: Executor
+    follower: Follower
+    step_rate: StepRate
 
     @contextmanager
     def transaction(self) -> Iterator[Session]:

@@ -8,11 +8,13 @@
 | not-found    | 404 | no such object for this key                                                               |
 | conflict     | 409 | the object's present state forbids it                                                     |
 | too-large    | 413 | more bytes than the limit                                                                 |
+| too-many     | 429 | more tracks, or steps a second, than the limit; Retry-After says when                      |
 | unavailable  | 503 | the database or the blob store cannot be reached                                          |
 """
 
 import logging
 from collections.abc import Sequence
+from math import ceil
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -32,10 +34,21 @@ from app.errors import (
     IsodynError,
     NotFound,
     TooLarge,
+    TooMany,
     UnreadableSurvey,
 )
 
-__all__ = ["ERROR_RESPONSES", "Forbidden", "Problem", "Unauthorised", "add_problem_handlers", "problem_response"]
+__all__ = [
+    "ERROR_RESPONSES",
+    "TOO_MANY",
+    "Forbidden",
+    "Problem",
+    "Unauthorised",
+    "add_problem_handlers",
+    "isodyn_problem",
+    "problem_response",
+    "validation_problem",
+]
 
 _log = logging.getLogger(__name__)
 TYPE_BASE = "https://isodyn.dev/problems/"
@@ -61,6 +74,7 @@ _KINDS: dict[type[IsodynError], tuple[int, str, str]] = {
     NotFound: (404, "not-found", "Not found"),
     Conflict: (409, "conflict", "The object's state forbids it"),
     TooLarge: (413, "too-large", "Too large"),
+    TooMany: (429, "too-many", "Too many"),
     CorruptArtefact: (500, "corrupt-artefact", "Stored data is damaged"),
     IsodynError: (500, "internal", "Something went wrong here"),
 }
@@ -97,6 +111,8 @@ ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
     503: _documented("The database or the blob store cannot be reached; try again"),
 }
 
+TOO_MANY: dict[int | str, dict[str, Any]] = {429: _documented("More than the limit for now; see Retry-After")}
+
 
 def problem_response(
     status: int, kind: str, title: str, detail: str, faults: Sequence[Fault] = (), headers: dict[str, str] | None = None
@@ -126,6 +142,8 @@ def isodyn_problem(error: IsodynError) -> JSONResponse:
     """The problem document of an error of the tree."""
     status, kind, title = next(_KINDS[cls] for cls in type(error).__mro__ if cls in _KINDS)
     headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    if isinstance(error, TooMany) and error.retry_after_s is not None:
+        headers = {"Retry-After": str(max(ceil(error.retry_after_s), 1))}
     return problem_response(status, kind, title, str(error), error.faults, headers)
 
 
@@ -145,7 +163,12 @@ def _tell_the_log(request: Request, error: Exception) -> None:
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     not_json = "json" not in request.headers.get("content-type", "application/json")
-    faults = [_fault(each["loc"], each["msg"], not_json) for each in error.errors()]
+    return validation_problem(error.errors(), not_json)
+
+
+def validation_problem(errors: Sequence[Any], not_json: bool = False) -> JSONResponse:
+    """The problem document of what pydantic found in a request, or in a message."""
+    faults = [_fault(each["loc"], each["msg"], not_json) for each in errors]
     detail = f"{faults[0].location}: {faults[0].reason}" if faults else "the request does not fit its description"
     return problem_response(422, "invalid-input", "The request cannot be used", detail, faults[:50])
 

@@ -47,7 +47,7 @@ def serve(
     try:
         console.print(f"Isodyn listens on http://{settings.host}:{settings.port} (page: /view/, contract: /docs)")
         uvicorn.run(app, host=settings.host, port=settings.port, log_level="warning", access_log=False,
-                    timeout_graceful_shutdown=10)  # fmt: skip
+                    timeout_graceful_shutdown=10, ws_max_size=2**20)  # fmt: skip
     finally:
         if supervisor is not None:
             supervisor.stop()

@@ -1,4 +1,4 @@
-"""The tables: organisation, key, building, floor, survey, map, job; and worker and idempotency beside them.
+"""The tables: organisation, key, building, floor, survey, map, job, track; and worker and idempotency beside them.
 
 Ids are UUIDv7 strings, so they sort by creation. Times are UTC. Every row that a key may reach carries its
 organisation. `migrations/` holds the same schema as history; a test compares the two.
@@ -7,7 +7,18 @@ organisation. `migrations/` holds the same schema as history; a test compares th
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import JSON, DateTime, Dialect, ForeignKey, Index, MetaData, String, UniqueConstraint
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    MetaData,
+    String,
+    UniqueConstraint,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.types import TypeDecorator
 from uuid6 import uuid7
@@ -24,6 +35,9 @@ __all__ = [
     "Organisation",
     "REBUILD",
     "Survey",
+    "Track",
+    "TrackState",
+    "TrackSteps",
     "Worker",
     "new_id",
 ]
@@ -187,6 +201,63 @@ class Job(Base):
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     result: Mapped[dict[str, Any] | None]
+
+
+class Track(Base):
+    """`status`: active, ended. `spec` is what it is followed by, pinned when it was made: floors with their maps,
+    options, prior and ground (`app.services.track_spec`). `version` grows with every write, so that whoever followed
+    from an older one is noticed. `waiting` are steps that came before one that is missing, `gaps` numbers that were
+    given up: [first, stop). `ended_reason`: idle, asked."""
+
+    __tablename__ = "track"
+    __table_args__ = (
+        Index("ix_track_organisation_id_id", "organisation_id", "id"),
+        Index("ix_track_key_id_status", "key_id", "status"),
+        Index("ix_track_status_touched_at", "status", "touched_at"),
+    )
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    key_id: Mapped[str] = mapped_column(ForeignKey("key.id"))
+    building_id: Mapped[str] = mapped_column(ForeignKey("building.id"), index=True)
+    name: Mapped[str | None] = mapped_column(String(200))
+    status: Mapped[str] = mapped_column(String(20), default="active")
+    ended_reason: Mapped[str | None] = mapped_column(String(20))
+    frame: Mapped[str] = mapped_column(String(20))
+    seed: Mapped[int] = mapped_column(BigInteger)
+    spec: Mapped[dict[str, Any]]
+    version: Mapped[int] = mapped_column(default=0)
+    batches: Mapped[int] = mapped_column(default=0)
+    next_step: Mapped[int] = mapped_column(BigInteger, default=0)
+    waiting: Mapped[list[dict[str, Any]]] = mapped_column(JSON, default=list)
+    gaps: Mapped[list[list[int]]] = mapped_column(JSON, default=list)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    touched_at: Mapped[datetime] = mapped_column(default=utc_now)
+    ended_at: Mapped[datetime | None]
+
+
+class TrackSteps(Base):
+    """Steps as they were followed, a batch a row, in order: `sequence` counts the track's batches from zero.
+
+    `data` is compressed JSON: the steps, the estimate that was answered, and the path (`app.services.track_log`).
+    `settled` are the places that were smoothed for good; `sha256` is that of all the batch said."""
+
+    __tablename__ = "track_steps"
+    track_id: Mapped[str] = mapped_column(ForeignKey("track.id"), primary_key=True)
+    sequence: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    next_step: Mapped[int] = mapped_column(BigInteger)
+    data: Mapped[bytes] = mapped_column(LargeBinary)
+    settled: Mapped[list[Any] | None] = mapped_column(JSON(none_as_null=True))
+    sha256: Mapped[str] = mapped_column(Sha256)
+
+
+class TrackState(Base):
+    """A cache: the state after the first `batches` batches, so that a restart follows only what came after."""
+
+    __tablename__ = "track_state"
+    track_id: Mapped[str] = mapped_column(ForeignKey("track.id"), primary_key=True)
+    batches: Mapped[int]
+    written_by: Mapped[str] = mapped_column(String(40))
+    data: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class Worker(Base):

@@ -15,7 +15,10 @@ from app.errors import Fault, InvalidInput
 from app.geodesy import Anchor, building_from_wgs84, east_north_up_m
 from app.geometry import Array
 
-__all__ = ["Outline", "Place", "in_building", "members", "on_earth", "outline_of", "read_polygons", "refuse"]
+__all__ = [
+    "Outline", "Place", "Polygon", "in_building", "members", "on_earth", "outline_of", "read_lines", "read_polygons",
+    "refuse",
+]  # fmt: skip
 
 FARTHEST_M = 10_000.0
 SMALLEST_M = 0.5
@@ -45,6 +48,24 @@ def read_polygons(geometry: object, where: str, place: Place) -> list[Polygon]:
     if kind == "Polygon":
         return [_polygon(coordinates, pointer, place)]
     return [_polygon(rings, f"{pointer}/{k}", place) for k, rings in enumerate(coordinates)]
+
+
+def read_lines(geometry: object, where: str, place: Place) -> list[list[list[float]]]:
+    """The lines of a GeoJSON LineString or MultiLineString at the JSON pointer `where`, in building metres.
+
+    Raises InvalidInput.
+    """
+    kind = members(geometry, where).get("type")
+    if kind not in ("LineString", "MultiLineString"):
+        refuse(f"{where}/type", f"walls are a LineString or a MultiLineString, this is {_quote(kind)}")
+    pointer = f"{where}/coordinates"
+    coordinates = _list(members(geometry, where).get("coordinates"), pointer, "lines or positions", 1)
+    lines = [(coordinates, pointer)]
+    if kind == "MultiLineString":
+        lines = [
+            (_list(line, f"{pointer}/{k}", "positions", 2), f"{pointer}/{k}") for k, line in enumerate(coordinates)
+        ]
+    return [_line(line, at, place) for line, at in lines]
 
 
 def outline_of(polygons: list[Polygon], where: str) -> Outline:
@@ -118,6 +139,12 @@ def _ring(ring: object, where: str, place: Place) -> list[list[float]]:
     if positions[0] != positions[-1]:
         refuse(where, f"the ring is not closed: its last position {positions[-1]} must repeat its first {positions[0]}")
     placed: list[list[float]] = np.round(place(np.array(positions), where), DECIMALS).tolist()
+    return placed
+
+
+def _line(line: list[object], where: str, place: Place) -> list[list[float]]:
+    positions = np.array(list(_positions(_list(line, where, "positions", 2), where)))
+    placed: list[list[float]] = np.round(place(positions, where), DECIMALS).tolist()
     return placed
 
 

@@ -9,6 +9,7 @@ from fastapi.routing import APIRoute
 
 OPEN = {"/healthz", "/readyz"}
 LOCATING = ("/locate", "/locate:batch", "/replay")
+TRACKS = "/v1/tracks"
 OUTLINE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 5], [0, 5], [0, 0]]]}
 BODIES: dict[str, Any] = {
     "/v1/buildings/{building_id}/floors": {"name": "x", "ordinal": 1},
@@ -19,6 +20,7 @@ BODIES: dict[str, Any] = {
     "/v1/buildings/{building_id}/floors:import": {"type": "FeatureCollection", "features": []},
     "/v1/buildings/{building_id}": {},
     "/v1/floors/{floor_id}": {},
+    "/v1/tracks/{track_id}/steps": {"steps": [{"number": 0, "t_s": 0.0}]},
 }
 WINDOW = {"window": {"frame": "norm", "b_ut": [50.0], "displacement_m": [[0, 0, 0]]}}
 QUERIES = {
@@ -36,7 +38,9 @@ def _routes(app: Any) -> list[tuple[str, str]]:
 def ids(service: Any, building: str, mapped_floor: str, active_map: str) -> dict[str, str]:
     survey = service.http.get(f"/v1/floors/{mapped_floor}/surveys").json()["items"][0]["id"]
     job = service.http.get("/v1/jobs", params={"floor_id": mapped_floor}).json()["items"][0]["id"]
+    track = service.http.post("/v1/tracks", json={"floor_ids": [mapped_floor], "frame": "norm"}).json()["id"]
     return {
+        "track_id": track,
         "building_id": building,
         "floor_id": mapped_floor,
         "map_id": active_map,
@@ -48,7 +52,7 @@ def ids(service: Any, building: str, mapped_floor: str, active_map: str) -> dict
 def _call(http: Any, method: str, path: str, ids: dict[str, str], headers: dict[str, str]) -> Any:
     url = re.sub(r"{(\w+)}", lambda name: ids[name[1]], path)
     arguments: dict[str, Any] = {"headers": headers, "params": QUERIES.get(path)}
-    if path.endswith(("/surveys", "/replay")) and method == "POST":
+    if path.endswith(("/surveys", "floor_id}/replay")) and method == "POST":
         arguments["content"] = b"t_s\n"
     elif method in ("POST", "PATCH", "PUT"):
         body = {"queries": [WINDOW]} if path.endswith(":batch") else WINDOW if path.endswith("locate") else None
@@ -71,7 +75,7 @@ def test_every_object_of_another_organisation_is_not_found(
 
 
 def test_lists_of_another_organisation_are_empty(service: Any, ids: dict[str, str], stranger: dict[str, str]) -> None:
-    for path in ("/v1/buildings", "/v1/jobs"):
+    for path in ("/v1/buildings", "/v1/jobs", "/v1/tracks"):
         assert service.http.get(path).json()["items"]
         assert service.http.get(path, headers=stranger).json()["items"] == []
 
@@ -92,7 +96,8 @@ def test_a_key_does_only_what_its_scopes_say(
         if path in OPEN:
             continue
         answer = _call(service.http, method, path, ids, locating)
-        assert (answer.status_code != 403) == path.endswith(LOCATING), (method, path, answer.text)
+        may = path.endswith(LOCATING) or path.startswith(TRACKS)
+        assert (answer.status_code != 403) == may, (method, path, answer.text)
         if method != "GET" and not path.endswith("/field"):
             assert _call(service.http, method, path, ids, reading).status_code == 403, (method, path)
 

@@ -1,0 +1,138 @@
+"""What a track is followed by, pinned when it is made, as JSON and as a tracker.
+
+Maps never change under their hash and options are written out with their values, so that the same steps give the same
+track later on, whatever was built or tuned since.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields, replace
+from functools import partial
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Fault, InvalidInput
+from app.geometry import Array
+from app.positioning.window import WindowFrame
+from app.services.grid_cache import GridCache
+from app.services.locate_window import ActiveMap
+from app.tracking.ground import Connector, Ground, barriers_of
+from app.tracking.options import StartPrior, TrackOptions
+from app.tracking.track import make_tracker
+from app.tracking.track_state import Tracker
+
+__all__ = ["CORE_FRAME", "TrackSpec", "Trackers", "check_walkable", "make_spec"]
+
+CORE_FRAME: dict[str, WindowFrame] = {"building": "building", "body": "building", "level": "level", "norm": "norm"}
+"""The core's frame of each frame of the contract: a body step is turned to the building frame as it comes in."""
+
+TrackSpec = dict[str, Any]
+"""`maps` [[floor id, map id, hash of the grid]], `options` by name, `prior`, and `ground`: `walkable` polygons and
+`walls` by floor id, `connectors`; all coordinates building metres."""
+
+_MOST_TRACKERS = 32
+
+
+def make_spec(
+    maps: Sequence[ActiveMap], options: TrackOptions, prior: StartPrior | None, ground: Mapping[str, Any]
+) -> TrackSpec:
+    """Everything that is pinned, as JSON."""
+    told = {name: value for name, value in asdict(replace(options, ground=None)).items() if name != "ground"}
+    return {
+        "maps": [[each.floor_id, each.map_id, each.grid_sha256] for each in maps],
+        "options": told,
+        "prior": None if prior is None else {"position_m": list(prior.position_m), "sd_m": prior.sd_m},
+        "ground": dict(ground),
+    }
+
+
+class Trackers:
+    """Trackers of pinned specifications. Those on the same maps share them: they are much the largest part."""
+
+    def __init__(self, grids: GridCache) -> None:
+        self._grids = grids
+        self._shared: OrderedDict[tuple[Any, ...], Tracker] = OrderedDict()
+        self._lock = Lock()
+
+    def make(self, spec: TrackSpec, frame: str, seed: int) -> Tracker:
+        """Raises IncompatibleFrames; NotFound and CorruptArtefact for a grid that is gone."""
+        shared = self._of_maps(tuple((floor_id, sha256) for floor_id, _, sha256 in spec["maps"]), CORE_FRAME[frame])
+        known = {field.name for field in fields(TrackOptions)}
+        told = {name: value for name, value in spec["options"].items() if name in known}
+        ground, prior = _ground(spec["ground"]), spec["prior"]
+        walls = {} if ground is None else ground.walls
+        return replace(
+            shared,
+            options=TrackOptions(**told, ground=ground),
+            barriers=barriers_of(walls, [floor.floor_id for floor in shared.floors]),
+            seed=seed,
+            prior=None if prior is None else StartPrior((*prior["position_m"],), prior["sd_m"]),
+        )
+
+    def _of_maps(self, maps: tuple[tuple[str, str], ...], frame: WindowFrame) -> Tracker:
+        key = (maps, frame)
+        with self._lock:
+            if key in self._shared:
+                self._shared.move_to_end(key)
+                return self._shared[key]
+        shared = make_tracker(self._grids.searchable(maps), frame, TrackOptions(), 0)
+        with self._lock:
+            shared = self._shared.setdefault(key, shared)
+            while len(self._shared) > _MOST_TRACKERS:
+                self._shared.popitem(last=False)
+        return shared
+
+
+def check_walkable(tracker: Tracker) -> None:
+    """Raise InvalidInput where no floor has a mapped place that one can walk on."""
+    ground = tracker.options.ground
+    if ground is None or not ground.walkable:
+        return
+    for floor in tracker.floors:
+        inside = ground.walkable.get(floor.floor_id)
+        for plane in floor.planes:
+            at = np.argwhere(plane.measured)[:, ::-1]
+            points = np.asarray(plane.origin_m) + plane.resolution_m * at
+            if len(points) and (inside is None or inside(points).any()):
+                return
+    reason = "the walkable area holds no mapped place of any floor; draw it in building metres, over the map"
+    raise InvalidInput(reason, Fault("/body/options/walkable", reason))
+
+
+def _ground(told: Mapping[str, Any]) -> Ground | None:
+    walkable: Mapping[str, list[list[list[list[float]]]]] = told.get("walkable", {})
+    walls: Mapping[str, list[list[list[float]]]] = told.get("walls", {})
+    connectors: list[dict[str, Any]] = told.get("connectors", [])
+    if not (walkable or walls or connectors):
+        return None
+    edges = {floor_id: [ring for rings in polygons for ring in rings] for floor_id, polygons in walkable.items()}
+    lines = {floor_id: [*edges.get(floor_id, []), *walls.get(floor_id, [])] for floor_id in {*edges, *walls}}
+    return Ground(
+        walls={floor_id: _segments(lines[floor_id]) for floor_id in sorted(lines)},
+        walkable={floor_id: _inside(polygons) for floor_id, polygons in walkable.items()},
+        connectors=tuple(
+            Connector(each["kind"], tuple(each["floor_ids"]), _inside(each["polygons"])) for each in connectors
+        ),
+    )
+
+
+def _segments(lines: Sequence[Sequence[Sequence[float]]]) -> Array:
+    """(k, 2, 2) of lines of positions."""
+    return np.concatenate([np.stack([np.array(line)[:-1], np.array(line)[1:]], axis=1) for line in lines])
+
+
+def _inside(polygons: Sequence[Sequence[Sequence[Sequence[float]]]]) -> Callable[[Array], NDArray[np.bool_]]:
+    return partial(_inside_rings, [np.array(ring) for rings in polygons for ring in rings])
+
+
+def _inside_rings(rings_m: Sequence[Array], points_m: Array) -> NDArray[np.bool_]:
+    """(n,) which points (n, 2) lie inside an odd number of rings."""
+    from matplotlib.path import Path  # costs a tenth of a second, which only those who ask should pay
+
+    inside = np.zeros(len(points_m), dtype=np.bool_)
+    for ring in rings_m:
+        inside ^= Path(ring).contains_points(points_m)
+    return inside
