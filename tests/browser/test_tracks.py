@@ -23,7 +23,7 @@ def steps(town: Any) -> Callable[..., list[dict[str, Any]]]:
         c, s = np.cos(TURN_RAD), np.sin(TURN_RAD)
         back = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         moved = (p - p[0]) @ back
-        B = town.world.field_uT(p + [elsewhere_m, 0.0, 0.0]) @ back
+        B = town.world.field_uT(p + np.array([elsewhere_m, 0.0, 0.0])) @ back
         B += np.random.default_rng(3).normal(0.0, 0.3, B.shape)
         return [
             {"number": k, "t_s": 0.1 * k, "displacement_m": moved[k].tolist(), "b_ut": B[k].tolist()}
@@ -97,7 +97,7 @@ def test_a_device_is_seen_as_it_is_found_and_goes_on(seat, town, begin, steps):
     expect(item).to_contain_text(_said(estimate))
     me.keep("tracks")
     assert (me.settled() != near).any(axis=-1).mean() > 1e-3
-    me.choose_floor(1)
+    me.page.locator("#floor").select_option(town.floors[1])
     expect(button).to_have_attribute("aria-pressed", "false")
     expect(item).to_contain_text("Floor 0")
     town.api.post(f"/v1/tracks/{track}/end")
