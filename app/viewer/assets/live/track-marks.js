@@ -17,11 +17,14 @@ export function ago(seconds) {
 export function whereabouts({ estimate, path }) {
   if (!estimate.position_m) return "no place found yet";
   const [x, y] = estimate.position_m.map(fixed);
+  if (estimate.state !== "converged") return `perhaps x ${x} m, y ${y} m (${Math.round(100 * shareOf(estimate))} %)`;
   const course = courseOf(estimate, path);
   return `x ${x} m, y ${y} m; within ${fixed(estimate.radius_95_m)} m with 95 %`
     + (course === null ? "" : `; heading ${Math.round((course * 180) / Math.PI + 360) % 360}°`);
 }
 
+/** Of the strongest place. */
+const shareOf = (estimate) => estimate.modes[0]?.probability ?? 0;
 const fixed = (value) => value.toFixed(2).replace("-", "−");
 
 /** The path with what is new of it: settled places stay, of the others the latest holds; of the last minutes. */
@@ -38,17 +41,19 @@ export function marksOf(tracks) {
   return {
     of: "tracks",
     modes: drawn.flatMap(modesOf).slice(0, 64),
-    ellipses: drawn.map(({ estimate: e }) => ({ floor_id: e.floor_id, position_m: e.position_m, covariance_m2: e.covariance_m2 })),
+    ellipses: drawn.filter(({ estimate }) => estimate.state !== "lost").map(ellipseOf),
     paths: drawn.flatMap(piecesOf).slice(-64),
   };
 }
+
+const ellipseOf = ({ estimate: { floor_id, position_m, covariance_m2 } }) => ({ floor_id, position_m, covariance_m2 });
 
 function modesOf({ track, estimate, path }) {
   const converged = estimate.state === "converged";
   const label = (converged ? nameOf(track) : `${nameOf(track)}: ${estimate.state}`).slice(0, 80);
   const first = {
     floor_id: estimate.floor_id, position_m: estimate.position_m, label, heading_rad: courseOf(estimate, path),
-    probability: converged ? 1 : (estimate.modes[0]?.probability ?? 0),
+    probability: converged ? 1 : shareOf(estimate),
   };
   const others = estimate.modes.slice(1, 8).map(({ floor_id, position_m, probability }) => ({ floor_id, position_m, probability }));
   return converged ? [first] : [first, ...others];
