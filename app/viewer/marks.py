@@ -103,12 +103,15 @@ def _path_pieces(name: str, path: Path, lift: _Lift) -> dict[str, Piece]:
 
 
 def _mode_pieces(name: str, mode: Mode, lift: _Lift) -> dict[str, Piece]:
-    """A ball, the larger the more probable, its label or its share in words, and a short line the way it heads."""
+    """A ball, the larger the more probable, its share in words, and a short line the way it heads.
+
+    One with a label is small, for its ellipse to be seen, and the label is high above it.
+    """
     place_m = np.array(mode.position_m[:2])
-    radius_m = round(0.15 + 0.25 * mode.probability**0.5, 2)
+    radius_m, words_m = (round(0.15 + 0.25 * mode.probability**0.5, 2), 0.5) if mode.label is None else (0.2, 1.2)
     pieces: dict[str, Piece] = {name: Ball(lift(place_m[None], _ABOVE_M["modes"])[0], ESTIMATE_RGB, radius_m)}
     if mode.label is not None or mode.probability >= 0.005:
-        pieces[f"{name}/share"] = Words((0.0, 0.0, 0.5), mode.label or f"{100 * mode.probability:.0f} %")
+        pieces[f"{name}/share"] = Words((0.0, 0.0, words_m), mode.label or f"{100 * mode.probability:.0f} %")
     if mode.heading_rad is not None:
         ahead_m = place_m + np.array([np.cos(mode.heading_rad), np.sin(mode.heading_rad)])
         line = lift(np.stack([place_m, ahead_m]), _ABOVE_M["modes"])

@@ -72,6 +72,7 @@ def _said(estimate: dict[str, Any]) -> str:
 
 def test_a_device_is_seen_as_it_is_found_and_goes_on(seat, town, begin, steps):
     me = seat().open(f"?floor={town.floors[0]}")
+    me.page.get_by_label("Field arrows").uncheck()
     me.tab("Tracks")
     expect(me.page.locator("#tracks-none")).to_contain_text("POST /v1/tracks")
     empty = me.settled()
@@ -117,6 +118,7 @@ def test_a_link_leads_to_a_track_and_only_its_organisation(seat, town, begin, st
     assert lost["state"] == "lost"
     expect(me.page.get_by_role("listitem").locator(".badge")).to_have_text("lost")
     expect(me.page.get_by_role("listitem")).to_contain_text(lost["reason"])
+    me.page.context.close()
     you = seat()
     you.sign_in(link, key=town.other_key)
     expect(you.page.locator("#tracks-told")).to_contain_text("not your organisation's", timeout=30_000)

@@ -91,7 +91,7 @@ class Scene:
     def __init__(self):
         self.sent = []
 
-    def add_frame(self, name, **_):
+    def add_frame(self, name, *_, **more):
         return Handle(self, name)
 
     add_icosphere = add_label = add_frame
