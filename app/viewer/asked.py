@@ -85,11 +85,14 @@ class Likelihood(_Asked):
 
 
 class Mode(_Asked):
+    """label: said beside it instead of its share."""
+
     model_config = ConfigDict(frozen=True, extra="ignore")
     floor_id: Id
     position_m: Point
     probability: Annotated[float, Field(ge=0, le=1)]
     heading_rad: Finite | None = None
+    label: Annotated[str, Field(max_length=80)] | None = None
 
 
 class Ellipse(_Asked):
@@ -109,8 +112,12 @@ class Path(_Asked):
 
 
 class Marks(_Asked):
-    """What is drawn over the floors: a window's answer, or a walk that is being followed. Replaces what was there."""
+    """What is drawn over the floors: an answer (of a window, or a walk replayed), or tracks that are being followed.
 
+    Replaces what was there `of` the same kind, and leaves the other.
+    """
+
+    of: Literal["answer", "tracks"] = "answer"
     likelihood: Likelihood | None = None
     modes: Annotated[list[Mode], Field(max_length=64)] = []
     ellipses: Annotated[list[Ellipse], Field(max_length=64)] = []

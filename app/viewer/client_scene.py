@@ -18,7 +18,7 @@ from app.viewer.chosen import Chosen, choose
 from app.viewer.floor_scene import DrawnFloor, ShownFloor, layer_scale, norm_scale, residual_scale
 from app.viewer.layers import ColourScale, about_layer
 from app.viewer.legends import legend
-from app.viewer.marks import draw_marks, likelihood_legend
+from app.viewer.marks import likelihood_legend
 from app.viewer.picture import Marked, Picked, Picture, SupportView, floors_in_words
 from app.viewer.pointing import camera_ray, kept_upright, plane_hit, supporting_walks
 
@@ -50,7 +50,7 @@ class ClientScene:
         self.asked = Shown()
         self.has_shown = False
         self.has_left = False
-        self.marks = Marks()
+        self.marks: dict[str, Marks] = {}
         client.camera.on_update(self._on_camera)
 
     # -- what the page asks -----------------------------------------------------------------------------------------
@@ -73,16 +73,16 @@ class ClientScene:
             return self._in_words(chosen, asked)
 
     def mark(self, marks: Marks) -> Marked:
-        """Draw a position, or a track, over the floors in place of the last; floors that are not shown are left out.
+        """Draw positions over the floors in place of the last of their kind; floors that are not shown are left out.
 
         The layer is dimmed under it.
         """
         with self._lock:
-            self.marks = marks
+            self.marks = self.marks | {marks.of: marks}
             with self._client.atomic():
                 for drawn in self._floors:
                     self._draw_layer(drawn, drawn.shown)
-                self._draw_marks()
+                    drawn.draw_marks(marks)
             return Marked(likelihood_legend=likelihood_legend() if marks.likelihood else None)
 
     def pick(self, target: Target) -> Picked | None:
@@ -153,17 +153,12 @@ class ClientScene:
             self._draw_layer(drawn, shown)
             if asked.walks:
                 drawn.draw_walks(self._residual_scale)
-        if self.marks:
-            self._draw_marks()
+            for marks in self.marks.values():
+                drawn.draw_marks(marks)
 
     def _draw_layer(self, drawn: DrawnFloor, shown: ShownFloor) -> None:
         if self._scale is not None:
-            drawn.draw_layer(shown, self._scale, self.marks)
-
-    def _draw_marks(self) -> None:
-        for drawn in self._floors:
-            floor = drawn.shown
-            draw_marks(self._client.scene, drawn.name, floor.floor.id, floor.height_m, self.marks, self._origin_m)
+            drawn.draw_layer(shown, self._scale, self.marks.values())
 
     def _separate(self, separation_m: float | None) -> None:
         self._separation_m = self._suggested_separation_m if separation_m is None else separation_m

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,8 @@ from app.geometry import Array
 from app.viewer import scene as draw
 from app.viewer.asked import Marks
 from app.viewer.layers import ColourScale, colour_scale, layer_values
-from app.viewer.marks import blend_likelihood
+from app.viewer.mark_nodes import MarkNodes
+from app.viewer.marks import blend_likelihood, mark_pieces
 from app.viewer.source import ViewedFloor, Walk
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ class DrawnFloor:
         self._values_drawn: Array | None = None
         self._look_drawn: object = None
         self._residuals_drawn: tuple[Array, ...] | None = None
+        self._marked: dict[str, MarkNodes] = {}
         outline = draw.ring_segments(shown.floor.rings_m, shown.floor.elevation_m, origin_m)
         if len(outline):
             self.nodes["outline"] = draw.draw_lines(scene, f"{name}/outline", outline, OUTLINE_RGB, 2.0)
@@ -91,21 +93,31 @@ class DrawnFloor:
         name = f"{self.name}/plan"
         self.nodes["plan"] = draw.draw_plan(self._scene, name, picture, floor.plan, floor.elevation_m, self.origin_m)
 
-    def draw_layer(self, shown: ShownFloor, scale: ColourScale, marks: Marks) -> None:
+    def draw_layer(self, shown: ShownFloor, scale: ColourScale, marks: Collection[Marks]) -> None:
         """The chosen layer as a picture in its plane; dimmed under marks, and a likelihood over it."""
-        likelihood = marks.likelihood if marks.likelihood and marks.likelihood.floor_id == shown.floor.id else None
-        look = (scale, bool(marks), likelihood)
+        likelihoods = (each.likelihood for each in marks if each.likelihood is not None)
+        likelihood = next((each for each in likelihoods if each.floor_id == shown.floor.id), None)
+        marked = any(marks)
+        look = (scale, marked, likelihood)
         same = shown.values is self._values_drawn and look == self._look_drawn
         self.shown = shown
         if shown.grid is None or shown.values is None or same:
             return
         picture = draw.surface(shown.grid, shown.values, scale, self.origin_m, shown.height_index)
-        if marks:
+        if marked:
             picture.rgba[..., :3] = np.round(_DIMMED * picture.rgba[..., :3])
         if likelihood is not None:
             blend_likelihood(picture, likelihood, self.origin_m)
         draw.draw_surface(self._scene, f"{self.name}/layer", picture)
         self._values_drawn, self._look_drawn = shown.values, look
+
+    def draw_marks(self, marks: Marks) -> None:
+        """What is marked on this floor of one kind, in place of what was."""
+        nodes = self._marked.get(marks.of)
+        if nodes is None:
+            root = f"{self.name}/{'marks' if marks.of == 'answer' else marks.of}"
+            nodes = self._marked.setdefault(marks.of, MarkNodes(self._scene, root))
+        nodes.draw(mark_pieces(self.shown.floor.id, self.shown.height_m, marks, self.origin_m))
 
     def draw_walks(self, scale: ColourScale | None) -> None:
         """The walks, in the colours of their residuals; nothing when they are drawn already."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,11 @@ from app.geometry import Array
 from app.viewer.asked import Ellipse, Likelihood, Marks, Mode, Path
 from app.viewer.layers import ColourScale
 from app.viewer.legends import Legend, legend
-from app.viewer.scene import Surface, draw_lines
+from app.viewer.mark_nodes import Ball, Line, Piece, Point, Words
+from app.viewer.scene import Surface
 
-if TYPE_CHECKING:
-    from viser import SceneApi
-
-__all__ = ["ESTIMATE_RGB", "LOWEST_NATS", "TRUTH_RGB", "blend_likelihood", "draw_marks", "ellipse_points_m",
-           "likelihood_legend"]  # fmt: skip
+__all__ = ["ESTIMATE_RGB", "LOWEST_NATS", "TRUTH_RGB", "blend_likelihood", "ellipse_points_m", "likelihood_legend",
+           "mark_pieces"]  # fmt: skip
 
 LOWEST_NATS = -20.0
 _LIKELIHOOD = ColourScale(LOWEST_NATS, 0.0, "inferno")
@@ -27,17 +25,18 @@ _ELLIPSE_SIGMAS = 2.4477  # holds 95 % of a Gaussian in the plane: the root of -
 _ABOVE_M = {"paths": 0.12, "ellipses": 0.14, "modes": 0.16}
 
 
-def draw_marks(scene: SceneApi, floor_node: str, floor_id: str, height_m: float, marks: Marks, origin_m: Array) -> None:
-    """Put what concerns one floor over it, in its node, in place of what was there."""
-    root = f"{floor_node}/marks"
-    scene.remove_by_name(root)
-    scene.add_frame(root, show_axes=False)
+def mark_pieces(floor_id: str, height_m: float, marks: Marks, origin_m: Array) -> dict[str, Piece]:
+    """What concerns one floor, over it, by name."""
+    lift = _Lift(height_m, origin_m)
+    pieces: dict[str, Piece] = {}
     for k, path in enumerate(p for p in marks.paths if p.floor_id == floor_id):
-        _draw_path(scene, f"{root}/path {k}", path, height_m, origin_m)
+        pieces |= _path_pieces(f"path {k}", path, lift)
     for k, ellipse in enumerate(e for e in marks.ellipses if e.floor_id == floor_id):
-        _draw_ellipse(scene, f"{root}/ellipse {k}", ellipse, height_m, origin_m)
+        line = lift(ellipse_points_m(ellipse), _ABOVE_M["ellipses"])
+        pieces[f"ellipse {k}"] = Line(line, ESTIMATE_RGB, 4.0)
     for k, mode in enumerate(m for m in marks.modes if m.floor_id == floor_id):
-        _draw_mode(scene, f"{root}/mode {k}", mode, height_m, origin_m)
+        pieces |= _mode_pieces(f"mode {k}", mode, lift)
+    return pieces
 
 
 def blend_likelihood(picture: Surface, likelihood: Likelihood, origin_m: Array) -> None:
@@ -83,37 +82,38 @@ def ellipse_points_m(ellipse: Ellipse, count: int = 64) -> Array:
     return np.asarray(np.array(ellipse.position_m[:2]) + circle * half_axes_m @ axes.T)
 
 
-def _draw_ellipse(scene: SceneApi, name: str, ellipse: Ellipse, height_m: float, origin_m: Array) -> None:
-    line = _lifted(ellipse_points_m(ellipse), height_m, _ABOVE_M["ellipses"], origin_m)
-    draw_lines(scene, name, _segments(line), ESTIMATE_RGB, 4.0)
+@dataclass(frozen=True, slots=True)
+class _Lift:
+    """Points (n, 2) of the plan at a height, a little above the layer: local metres."""
+
+    height_m: float
+    origin_m: Array
+
+    def __call__(self, p_m: Array, above_m: float) -> tuple[Point, ...]:
+        lifted = np.column_stack([p_m, np.full(len(p_m), self.height_m + above_m)]) - self.origin_m
+        return tuple((x, y, z) for x, y, z in lifted.tolist())
 
 
-def _draw_path(scene: SceneApi, name: str, path: Path, height_m: float, origin_m: Array) -> None:
+def _path_pieces(name: str, path: Path, lift: _Lift) -> dict[str, Piece]:
     if len(path.points_m) < 2:
-        return
-    line = _lifted(np.array(path.points_m)[:, :2], height_m, _ABOVE_M["paths"], origin_m)
+        return {}
+    line = lift(np.array(path.points_m)[:, :2], _ABOVE_M["paths"])
     truth = path.kind == "truth"
-    draw_lines(scene, name, _segments(line), TRUTH_RGB if truth else ESTIMATE_RGB, 2.0 if truth else 4.0)
+    return {name: Line(line, TRUTH_RGB if truth else ESTIMATE_RGB, 2.0 if truth else 4.0)}
 
 
-def _draw_mode(scene: SceneApi, name: str, mode: Mode, height_m: float, origin_m: Array) -> None:
-    """A ball, the larger the more probable, its share in words, and a short line the way the device faces."""
-    at = _lifted(np.array([mode.position_m[:2]]), height_m, _ABOVE_M["modes"], origin_m)[0]
-    place = (float(at[0]), float(at[1]), float(at[2]))
-    scene.add_icosphere(
-        name, radius=0.15 + 0.25 * mode.probability**0.5, color=ESTIMATE_RGB, position=place, cast_shadow=False
-    )
-    if mode.probability >= 0.005:
-        scene.add_label(f"{name}/share", f"{100 * mode.probability:.0f} %", position=(0.0, 0.0, 0.5))
+def _mode_pieces(name: str, mode: Mode, lift: _Lift) -> dict[str, Piece]:
+    """A ball, the larger the more probable, its share in words, and a short line the way it heads.
+
+    One with a label is small, for its ellipse to be seen, and the label is high above it.
+    """
+    place_m = np.array(mode.position_m[:2])
+    radius_m, words_m = (round(0.15 + 0.25 * mode.probability**0.5, 2), 0.5) if mode.label is None else (0.2, 1.2)
+    pieces: dict[str, Piece] = {name: Ball(lift(place_m[None], _ABOVE_M["modes"])[0], ESTIMATE_RGB, radius_m)}
+    if mode.label is not None or mode.probability >= 0.005:
+        pieces[f"{name}/share"] = Words((0.0, 0.0, words_m), mode.label or f"{100 * mode.probability:.0f} %")
     if mode.heading_rad is not None:
-        ahead = at + np.array([np.cos(mode.heading_rad), np.sin(mode.heading_rad), 0.0])
-        draw_lines(scene, f"{name} heading", np.stack([at, ahead])[None].astype(np.float32), ESTIMATE_RGB, 5.0)
-
-
-def _lifted(p_m: Array, height_m: float, above_m: float, origin_m: Array) -> Array:
-    """Points (n, 2) of the plan at a height, a little above the layer: (n, 3) local metres."""
-    return np.asarray(np.column_stack([p_m, np.full(len(p_m), height_m + above_m)]) - origin_m)
-
-
-def _segments(line_m: Array) -> NDArray[np.float32]:
-    return np.stack([line_m[:-1], line_m[1:]], axis=1).astype(np.float32)
+        ahead_m = place_m + np.array([np.cos(mode.heading_rad), np.sin(mode.heading_rad)])
+        line = lift(np.stack([place_m, ahead_m]), _ABOVE_M["modes"])
+        pieces[f"{name} heading"] = Line(line, ESTIMATE_RGB, 5.0)
+    return pieces

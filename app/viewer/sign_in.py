@@ -9,7 +9,7 @@ from app.viewer.asked import ASKED_BY
 
 __all__ = ["LINK", "SIGN_IN_POLICY", "sign_in_html"]
 
-LINK = (*ASKED_BY, "camera")
+LINK = (*ASKED_BY, "camera", "track")
 """What a deep link may ask for."""
 
 _STYLE = """

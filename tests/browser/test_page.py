@@ -231,7 +231,7 @@ def test_it_fits_a_small_screen_and_a_tablet(seat, town, width, height):
     picture = me.settled()
     assert colourful_share(picture) > 0.08
     overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-    for name in ("Field", "Positions", "Surveys", "Maps"):
+    for name in ("Field", "Positions", "Tracks", "Surveys", "Maps"):
         me.tab(name)
         assert me.page.evaluate(overflow) == 0
         panel = me.page.locator("#panel").evaluate("(e) => e.scrollWidth - e.clientWidth")

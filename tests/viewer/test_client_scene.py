@@ -158,6 +158,23 @@ def test_positions_are_marked_on_their_floor_and_taken_away(looking):
     assert "31 %" not in looking.canvas.labels()
 
 
+def test_tracks_and_an_answer_do_not_disturb_each_other(looking):
+    looking.ask("show", floor_id="floor-0")
+    place = {"floor_id": "floor-0", "position_m": [102.0, 41.0, 1.2], "probability": 1.0}
+    looking.ask("mark", modes=[place])
+    looking.ask("mark", of="tracks", modes=[place | {"label": "phone 3"}])
+    looking.ask("mark", of="tracks", modes=[place | {"label": "phone 3", "position_m": [103.0, 41.0, 1.2]}])
+    looking.canvas.read_until(lambda p: "phone 3" in p.labels())
+    looking.canvas.read_for(0.3)
+    assert looking.canvas.labels().count("phone 3") == 1, "it is moved, not drawn anew"
+    looking.ask("mark", of="tracks")
+    looking.canvas.read_until(lambda p: p.of_type("RemoveSceneNodeMessage"))
+    looking.canvas.read_for(0.3)
+    gone = {m["name"] for m in looking.canvas.of_type("RemoveSceneNodeMessage")}
+    assert "/floor 0/tracks/mode 0" in gone
+    assert not any("/marks" in name for name in gone)
+
+
 def test_the_nearer_the_camera_the_closer_the_arrows(looking):
     looking.ask("show", floor_id="floor-0")
     canvas = looking.canvas

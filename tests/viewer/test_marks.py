@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from app.viewer.asked import Ellipse, Likelihood
+from app.viewer.asked import Ellipse, Likelihood, Marks, Mode, Path
 from app.viewer.layers import ColourScale, layer_values
-from app.viewer.marks import blend_likelihood, ellipse_points_m, likelihood_legend
+from app.viewer.mark_nodes import Ball, Line, MarkNodes, Words
+from app.viewer.marks import blend_likelihood, ellipse_points_m, likelihood_legend, mark_pieces
 from app.viewer.scene import surface
 
 
@@ -55,3 +56,67 @@ def test_the_likelihoods_legend_says_what_it_is():
     assert told.unit == "nats"
     assert told.ticks[0] == "-20.0"
     assert told.ticks[-1] == "0.0"
+
+
+def test_what_concerns_a_floor_is_named_by_what_it_is():
+    here = {"floor_id": "a", "position_m": [3.0, -1.0, 0.0]}
+    modes = [Mode(**here, probability=1.0, heading_rad=0.0, label="phone"), Mode(**here, probability=0.25),
+             Mode(**here | {"floor_id": "b"}, probability=0.5)]  # fmt: skip
+    path = Path(floor_id="a", kind="estimate", points_m=[[0, 0, 0], [1, 0, 0]])
+    alone = Path(floor_id="a", kind="estimate", points_m=[[0, 0, 0]])
+    marks = Marks(modes=modes, paths=[path, alone], ellipses=[Ellipse(**here, covariance_m2=[[1, 0], [0, 1]])])
+    pieces = mark_pieces("a", 1.0, marks, np.array([3.0, 0.0, 0.0]))
+    assert list(pieces) == ["path 0", "ellipse 0", "mode 0", "mode 0/share", "mode 0 heading", "mode 1", "mode 1/share"]
+    assert pieces["mode 0"].at_m == pytest.approx((0.0, -1.0, 1.16))
+    assert pieces["mode 0 heading"].points_m[1] == pytest.approx((1.0, -1.0, 1.16))
+    assert (pieces["mode 0/share"].text, pieces["mode 1/share"].text) == ("phone", "25 %")
+    assert mark_pieces("c", 1.0, marks, np.zeros(3)) == {}
+
+
+class Handle:
+    def __init__(self, scene, name, position=None):
+        self.__dict__.update(scene=scene, name=name)
+        scene.sent.append(("add", name))
+
+    def __setattr__(self, what, value):
+        self.scene.sent.append(("move", self.name))
+
+    def remove(self):
+        self.scene.sent.append(("remove", self.name))
+
+
+class Scene:
+    """Writes down what it is asked for."""
+
+    def __init__(self):
+        self.sent = []
+
+    def add_frame(self, name, *_, **more):
+        return Handle(self, name)
+
+    add_icosphere = add_label = add_frame
+
+    def add_line_segments(self, name, points, colours, **_):
+        return Handle(self, name)
+
+    def told(self):
+        told, self.sent = self.sent, []
+        return told
+
+
+def test_of_marks_only_what_changed_is_sent():
+    scene = Scene()
+    nodes = MarkNodes(scene, "/floor 0/tracks")
+    red, line = (255, 0, 0), Line(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), (255, 0, 0), 2.0)
+    first = {"line": line, "ball": Ball((0.0, 0.0, 0.0), red, 0.4), "ball/share": Words((0.0, 0.0, 0.5), "phone")}
+    nodes.draw(first)
+    assert scene.told() == [("add", f"/floor 0/tracks{name}") for name in ("", "/line", "/ball", "/ball/share")]
+    nodes.draw(dict(first))
+    assert scene.told() == []
+    nodes.draw(first | {"ball": Ball((1.0, 0.0, 0.0), red, 0.4)})
+    assert scene.told() == [("move", "/floor 0/tracks/ball")], "and its label with it"
+    longer = Line((*line.points_m, (2.0, 0.0, 0.0)), red, 2.0)
+    nodes.draw(first | {"line": longer, "ball": Ball((1.0, 0.0, 0.0), red, 0.4)})
+    assert scene.told() == [("add", "/floor 0/tracks/line")], "in place, without being taken away"
+    nodes.draw({})
+    assert scene.told() == [("remove", f"/floor 0/tracks/{name}") for name in ("line", "ball/share", "ball")]

@@ -8,15 +8,16 @@ import * as positions from "./positions.js";
 import { camera, show, showPoster, watchPointer } from "./scene.js";
 import { ask } from "./server.js";
 import * as surveys from "./surveys.js";
+import * as tracks from "./tracks.js";
 
-const LINKED = ["building", "floor", "map", "versus", "layer", "height", "camera"];
+const LINKED = ["building", "floor", "map", "versus", "layer", "height", "camera", "track"];
 const asked = Object.fromEntries(new URLSearchParams(location.search));
 
 /** What is chosen now; ids are null for "all" and "the active one". */
 export const state = {
   building: asked.building ?? null, floor: asked.floor ?? null, map: asked.map ?? null, versus: asked.versus ?? null,
   layer: asked.layer ?? "norm", height: number(asked.height), arrows: true, walks: null, outline: true, plan: true,
-  separation: null, camera: pose(asked.camera) ?? "keep", cameraText: asked.camera ?? null, content: null, picture: null,
+  separation: null, camera: pose(asked.camera) ?? "keep", cameraText: asked.camera ?? null, track: asked.track ?? null, content: null, picture: null,
   likelihoodLegend: null, versions: {},
 };
 
@@ -59,6 +60,7 @@ function drawn(picture) {
     surveys.refresh();
     maps.refresh();
     plans.refresh();
+    tracks.wake();
   }
 }
 
@@ -72,10 +74,10 @@ function offerFloors() {
 }
 
 /** Put what is seen into the address, so that it can be sent to somebody. */
-function remember() {
+export function remember() {
   const link = {
     building: state.floor ? null : state.building, floor: state.floor, map: state.map, versus: state.versus,
-    layer: state.layer, height: state.height, camera: state.cameraText,
+    layer: state.layer, height: state.height, camera: state.cameraText, track: state.track,
   };
   const query = new URLSearchParams();
   for (const name of LINKED) if (link[name] !== null && link[name] !== "") query.set(name, link[name]);
@@ -91,9 +93,32 @@ async function rememberCamera() {
 
 /** Choose a floor (null: all) of a building, and look at it from the usual place. */
 function choose(building, floor) {
-  Object.assign(state, { building, floor, map: null, versus: null, walks: null, height: null, separation: null, cameraText: null });
+  turnTo(building, floor);
+  state.cameraText = null;
   positions.forget();
+  tracks.letGo();
   return redraw("oblique");
+}
+
+function turnTo(building, floor) {
+  Object.assign(state, { building, floor, map: null, versus: null, walks: null, height: null, separation: null });
+}
+
+/** Look at a place from where the camera is turned now, but near; its floor is shown. */
+export async function flyTo(floor, place_m) {
+  const seen = await camera().catch(() => null);
+  if (floor !== state.floor) turnTo(state.building, floor);
+  await redraw(nearPose(seen, place_m));
+  return rememberCamera();
+}
+
+const [NEAREST_M, FARTHEST_M] = [6, 14];
+
+function nearPose(seen, look_at_m) {
+  const away = seen ? seen.position_m.map((v, k) => v - seen.look_at_m[k]) : [0, -8, 8];
+  const far = Math.hypot(...away) || 1;
+  const wanted = Math.min(FARTHEST_M, Math.max(NEAREST_M, far));
+  return { position_m: look_at_m.map((v, k) => v + (away[k] * wanted) / far), look_at_m };
 }
 
 /** Read the pickers' content anew, after something changed, and draw. */
@@ -151,6 +176,7 @@ function wireTabs() {
       each.tabIndex = each === tab ? 0 : -1;
       byId(each.getAttribute("aria-controls")).hidden = each !== tab;
     }
+    tracks.wake();
   };
   for (const [k, tab] of tabs.entries()) {
     tab.addEventListener("click", () => open(tab));
@@ -180,7 +206,9 @@ async function start() {
   surveys.wire();
   maps.wire();
   plans.wire();
+  tracks.wire();
   await redraw(state.camera);
+  if (state.track) byId("tab-tracks").click();
 }
 
 start().catch((error) => put(byId("notes"), told(error)));
