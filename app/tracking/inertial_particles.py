@@ -1,13 +1,13 @@
-"""Particles for a device with a levelled accelerometer, a drone or a robot: what is linear in it is integrated exactly.
+"""Particles for a device with a levelled accelerometer, a drone or a robot: what is linear is integrated exactly.
 
-A particle is a position. Given its path, velocity v and accelerometer bias a are a linear Gaussian function of the steps
-it made, and readings are one of the magnetometer's offset b and of walk noise w (Schoen, Gustafsson and Nordlund 2005):
+A particle is a position. Given its path, velocity v and accelerometer bias a are linear Gaussian functions of the steps
+it made, and readings are of the magnetometer's offset b and walk noise w (Schoen, Gustafsson and Nordlund 2005):
     v' = v + T (mean acceleration - a) + noise,     p' = p + T v + (moved by the acceleration less a) + noise,
     z - m(p) = b + sigma(p) w + white noise,        w of unit variance and correlation exp(-way / length),
-so each particle has Kalman means of v, a, b and w per axis. The covariance of (v, a) depends on no reading and is one for
-all particles and axes; that of (b, w) depends on the map's variance where a particle has been, and is one for all axes.
-Shares and length of b, w and white noise are the map's (`ErrorStructure`): readings of a hovering drone meet one error of
-the map, however many they are. No jitter is needed: velocity that is not known parts the copies.
+so each particle has Kalman means of v, a, b and w per axis. The covariance of (v, a) depends on no reading and is one
+for all particles and axes; that of (b, w) depends on the map's variance where a particle has been, and is one for all
+axes. Shares and length of b, w and white noise are the map's (`ErrorStructure`): readings of a hovering drone meet one
+error of the map, however many they are. No jitter is needed: velocity that is not known parts the copies.
 
 Building frame, z up, metres, seconds, uT. `inertial_particles_plain` is the twin, one large Kalman filter a particle.
 """
@@ -23,7 +23,7 @@ from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.tracking.constraints import ALTIMETER_VARIANCE_M2, Box, altimeter_log_likelihood
 from app.tracking.field_likelihood import neutral
-from app.tracking.field_lookup import FieldTable, Looked, field_table, look_up
+from app.tracking.field_lookup import FieldTable, field_table, look_up
 from app.tracking.particle_filter import (
     RESAMPLE_BELOW,
     Estimate,
@@ -34,8 +34,8 @@ from app.tracking.particle_filter import (
 )
 
 __all__ = [
-    "COLUMNS", "Burst", "InertialMap", "InertialModel", "InertialParticles", "Stepped", "burst_of", "estimate_of",
-    "inertial_map", "move", "new_particles", "step", "weigh",
+    "COLUMNS", "Burst", "InertialMap", "InertialModel", "InertialParticles", "Stepped", "burst_of", "error_variances",
+    "estimate_of", "inertial_map", "move", "new_particles", "step", "weigh",
 ]  # fmt: skip
 
 P, V, A, B, W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
@@ -62,7 +62,7 @@ class InertialModel:
 
 
 class InertialMap(NamedTuple):
-    """The field, the mean variance (uT^2) that errors of surveys add to the map's own, the typical sum, and structure."""
+    """The field, the variance (uT^2) that errors of surveys add to the map's own, the typical sum, and structure."""
 
     table: FieldTable
     noise_uT2: float
@@ -138,7 +138,9 @@ def burst_of(acceleration_m_s2: Array, step_s: float, model: InertialModel) -> B
     noise = kick @ np.stack([later, np.ones(m)]).T
     noise[0, 0] += model.position_m_per_sqrt_s**2 * m * step_s
     transition = np.array([[1.0, -m * step_s], [0.0, 1.0]])
-    return Burst(gained[-1], step_s * gained.sum(axis=0), transition, np.array([m * step_s, -step_s * later.sum()]), noise)
+    return Burst(
+        gained[-1], step_s * gained.sum(axis=0), transition, np.array([m * step_s, -step_s * later.sum()]), noise
+    )
 
 
 def move(particles: InertialParticles, burst: Burst, noise: Array) -> InertialParticles:
@@ -164,34 +166,36 @@ def weigh(
     Where nothing is mapped a particle learns nothing, and keeps its share of the weight (`field_likelihood.neutral`).
     """
     rows, log_l = particles.rows.copy(), np.zeros(len(particles))
-    looked = look_up(the_map.table, rows[:, P])
+    looked, per_m = look_up(the_map.table, rows[:, P]), 1.0 / the_map.structure.walk_length_m
     way_m = np.sqrt(np.square(rows[:, P] - from_m).sum(axis=1))
-    _weigh(rows, log_l, way_m, reading_uT, *_looked(looked, the_map), looked.measured, *_shares(the_map, model))
+    errors = error_variances(looked.variance_uT2.mean(axis=1), the_map, model)
+    _weigh(rows, log_l, way_m, reading_uT, looked.mean_uT, *errors, looked.measured, per_m)
     log_l = neutral(log_l, looked.measured, particles.log_weight)
     return replace(particles, rows=rows, log_weight=particles.log_weight + log_l)
 
 
-def _looked(looked: Looked, the_map: InertialMap) -> tuple[Array, Array]:
-    """Mean (n, 3), and the variance (n,) of one more measurement about it."""
-    return looked.mean_uT, looked.variance_uT2.mean(axis=1) + the_map.noise_uT2
+def error_variances(own_uT2: Array, the_map: InertialMap, model: InertialModel) -> tuple[Array, float]:
+    """Variance of walk noise (n,) where the map's own is (n,), and the variance of white noise, uT^2.
 
-
-def _shares(the_map: InertialMap, model: InertialModel) -> tuple[float, float, float, float]:
+    What the map does not know of a place is one error there, however long a device hovers: it is walk noise at least,
+    and never white. Were white noise of the place, each reading would pay for hovering where the map is surer.
+    """
     shares = the_map.structure
-    return shares.walk_share, shares.white_share, model.reading_uT**2, 1.0 / shares.walk_length_m
+    walk = np.maximum(shares.walk_share * (own_uT2 + the_map.noise_uT2), own_uT2)
+    return walk, shares.white_share * the_map.typical_uT2 + model.reading_uT**2
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(  # type: ignore[no-untyped-def]
-    rows, log_l, way, reading, mean, variance, measured, walk_share, white_share, noise_uT2, per_m
+    rows, log_l, way, reading, mean, walk, white, measured, per_m
 ):
     for i in range(len(rows)):
         row = rows[i]
         fade = np.exp(-way[i] * per_m)
         bb, bw, ww = row[_BB], fade * row[_BW], fade * fade * row[_WW] + 1.0 - fade * fade
-        sigma = np.sqrt(walk_share * variance[i])
+        sigma = np.sqrt(walk[i])
         to_b, to_w = bb + sigma * bw, bw + sigma * ww
-        total = to_b + sigma * to_w + white_share * variance[i] + noise_uT2
+        total = to_b + sigma * to_w + white
         gain_b, gain_w = to_b / total, to_w / total
         if measured[i]:
             bb, bw, ww = bb - gain_b * to_b, bw - gain_b * to_w, ww - gain_w * to_w
@@ -241,7 +245,9 @@ def step(
     with np.errstate(divide="ignore"):
         log_weight = np.full(len(weight), -np.log(len(weight))) if resampled else np.log(weight)
     kept = replace(found, rows=found.rows[chosen], log_weight=log_weight)
-    return Stepped(kept, estimate, effective, -np.inf if diverged else log_sum - before, resampled, diverged, all_outside)
+    return Stepped(
+        kept, estimate, effective, -np.inf if diverged else log_sum - before, resampled, diverged, all_outside
+    )
 
 
 def _boxed(particles: InertialParticles, box: Box | None) -> tuple[InertialParticles, bool]:

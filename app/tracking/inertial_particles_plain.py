@@ -48,7 +48,7 @@ def _moved(
     from_m: Array, mean: Array, covariance: Array, acceleration_m_s2: Array, step_s: float, noise: Array,
     model: InertialModel,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Position (3,), mean (12,) and covariance (12, 12): (p, v, a, b, w) step by step, and then p is drawn and given."""
+    """Position (3,), mean (12,) and covariance (12, 12): (p, v, a, b, w) step by step, then p is drawn."""
     joint, P = np.concatenate([from_m, mean]), np.zeros((15, 15))
     P[3:, 3:] = covariance
     F, G = np.eye(15), np.zeros((15, 3))
@@ -70,9 +70,9 @@ def _weighed(
     """Mean and covariance after the reading, its log density, and whether the place is mapped."""
     field, shares = grid.at(at_m[None]), the_map.structure
     own = float(np.mean(np.square(field.sd_uT)))
-    variance = own + float(np.mean(np.square(grid.noise_sd_uT)))
-    H = np.hstack([_O, _O, _I, np.sqrt(shares.walk_share * variance) * _I])
-    S = H @ covariance @ H.T + (shares.white_share * variance + model.reading_uT**2) * _I
+    walk = max(shares.walk_share * (own + float(np.mean(np.square(grid.noise_sd_uT)))), own)
+    H = np.hstack([_O, _O, _I, np.sqrt(walk) * _I])
+    S = H @ covariance @ H.T + (shares.white_share * the_map.typical_uT2 + model.reading_uT**2) * _I
     gain, off = covariance @ H.T @ np.linalg.inv(S), reading_uT - field.mean_uT[0] - H @ mean
     log_l = -0.5 * float(off @ np.linalg.solve(S, off) + np.linalg.slogdet(2.0 * np.pi * S)[1])
     return (mean + gain @ off, covariance - gain @ H @ covariance), log_l, bool(field.measured[0])

@@ -14,6 +14,7 @@ from app.tracking.inertial_particles import (
     InertialModel,
     InertialParticles,
     burst_of,
+    error_variances,
     estimate_of,
     inertial_map,
     move,
@@ -68,15 +69,15 @@ def flight(grid, model, rng, steps, offset_sd_uT=None):
     true = path[1 + BURST :: BURST]
     the_map, shares = inertial_map(grid), grid.error_structure
     looked = look_up(the_map.table, true)
-    variance = looked.variance_uT2.mean(axis=1) + the_map.noise_uT2
+    walk_uT2, white_uT2 = error_variances(looked.variance_uT2.mean(axis=1), the_map, model)
     constant = np.hypot(model.offset_uT, np.sqrt(shares.constant_share * the_map.typical_uT2)) * rng.normal(size=3)
     walk = rng.normal(size=3)
     readings = np.empty_like(true)
     for k in range(len(true)):
         fade = np.exp(-np.linalg.norm(true[k] - true[k - 1]) / shares.walk_length_m) if k else 1.0
         walk = fade * walk + np.sqrt(1.0 - fade**2) * rng.normal(size=3)
-        white = np.sqrt(shares.white_share * variance[k] + model.reading_uT**2) * rng.normal(size=3)
-        readings[k] = looked.mean_uT[k] + constant + np.sqrt(shares.walk_share * variance[k]) * walk + white
+        white = np.sqrt(white_uT2) * rng.normal(size=3)
+        readings[k] = looked.mean_uT[k] + constant + np.sqrt(walk_uT2[k]) * walk + white
     bursts = (np.diff(velocity, axis=0) / STEP_S + noise).reshape(steps, BURST, 3)
     return path[1], velocity[0], true, bursts, readings
 
@@ -124,11 +125,11 @@ class TestTwin:
 
 class TestKalman:
     def test_mean_and_covariance_on_a_linear_field(self, linear):
-        """All is linear there but the way between readings, so walk noise is taken as white for this once."""
+        """All is linear there but the way between readings, so there is no walk noise this once."""
         structure, model = ErrorStructure(0.3, 0.0, 0.7, 1.0), InertialModel(position_m_per_sqrt_s=0.05)
-        grid = replace(linear, error_structure=structure)
+        grid = replace(linear, error_structure=structure, sd_uT=np.full_like(linear.sd_uT, 1e-4))
         at, velocity, _, bursts, readings = flown = flight(grid, model, np.random.default_rng(3), 30)
-        the_map, variance = inertial_map(grid), 0.1**2 + 0.2**2
+        the_map, variance = inertial_map(grid), 0.2**2
         mean = np.concatenate([at, velocity, np.zeros(6)])
         offset = model.offset_uT**2 + 0.3 * variance
         P = np.kron(np.diag([0.05**2, 0.05**2, model.bias_m_s2**2, offset]), np.eye(3))
@@ -160,7 +161,7 @@ class TestConsistency:
     def test_nees_of_flights_of_the_filters_own_model(self, bumpy):
         """Three degrees of freedom; half of what is expected to three times it: 400 particles are few."""
         model, nees = InertialModel(position_m_per_sqrt_s=0.014), []
-        for seed in range(12):
+        for seed in range(8):
             flown = flight(bumpy, model, np.random.default_rng(seed), 100)
             for stepped, true in list(zip(fly(bumpy, flown, model, 400, seed), flown[2], strict=True))[20::20]:
                 off = stepped.estimate.mean[:3] - true
