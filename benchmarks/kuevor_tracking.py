@@ -6,9 +6,9 @@ The filter is his (B27): dead reckoning with a 200 Hz accelerometer, attitude kn
 constant R_mag, the box, resampling below 0.75 n with jitter. It runs with the magnetometer (20 Hz), an altimeter as
 well (4 Hz), with the field's norm instead of the vector (B31), and with our likelihood, where R is the sensor's and the
 map's variance; and, beside it, with ours (`app/tracking/inertial_particles.py`: velocity, accelerometer bias and offset
-integrated per particle, errors alike along the way), told the sds of noise, bias and offset below. Values of his that the source does not print were proposed before these
-flights and are not tuned here: 1 uT, jitter of 2 cm and 0.05 m/s, a prior of 5 cm and 0.05 m/s. Flights have no take-off
-and landing.
+integrated per particle, errors alike along the way), told the sds of noise, bias and offset below. What the source does
+not print of his was proposed before these flights and is not tuned here: 1 uT, jitter of 2 cm and 0.05 m/s, a prior of
+5 cm and 0.05 m/s. Flights have no take-off and landing.
 
 Noise: accelerometer 1.5 m/s^2 white per sample and a constant 0.05 m/s^2 (1 sd); magnetometer 0.12 uT white and a
 constant 0.25 uT (1 sd) per flight; altimeter 3 cm, while the filter believes his 0.005 m^2.

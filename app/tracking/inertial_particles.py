@@ -25,13 +25,8 @@ from app.tracking.constraints import ALTIMETER_VARIANCE_M2, Box, altimeter_log_l
 from app.tracking.field_likelihood import neutral
 from app.tracking.field_lookup import FieldTable, field_table, look_up
 from app.tracking.particle_filter import (
-    RESAMPLE_BELOW,
-    Estimate,
-    effective_sample_size,
-    needs_resampling,
-    normalise,
-    systematic_ancestors,
-)
+    RESAMPLE_BELOW, Estimate, effective_sample_size, needs_resampling, normalise, systematic_ancestors,
+)  # fmt: skip
 
 __all__ = [
     "COLUMNS", "Burst", "InertialMap", "InertialModel", "InertialParticles", "Stepped", "burst_of", "error_variances",
@@ -137,10 +132,8 @@ def burst_of(acceleration_m_s2: Array, step_s: float, model: InertialModel) -> B
     kick = step_s**2 * model.acceleration_m_s2**2 * np.stack([later, np.ones(m)])
     noise = kick @ np.stack([later, np.ones(m)]).T
     noise[0, 0] += model.position_m_per_sqrt_s**2 * m * step_s
-    transition = np.array([[1.0, -m * step_s], [0.0, 1.0]])
-    return Burst(
-        gained[-1], step_s * gained.sum(axis=0), transition, np.array([m * step_s, -step_s * later.sum()]), noise
-    )
+    transition, lever = np.array([[1.0, -m * step_s], [0.0, 1.0]]), np.array([m * step_s, -step_s * later.sum()])
+    return Burst(gained[-1], step_s * gained.sum(axis=0), transition, lever, noise)
 
 
 def move(particles: InertialParticles, burst: Burst, noise: Array) -> InertialParticles:
@@ -245,9 +238,8 @@ def step(
     with np.errstate(divide="ignore"):
         log_weight = np.full(len(weight), -np.log(len(weight))) if resampled else np.log(weight)
     kept = replace(found, rows=found.rows[chosen], log_weight=log_weight)
-    return Stepped(
-        kept, estimate, effective, -np.inf if diverged else log_sum - before, resampled, diverged, all_outside
-    )
+    evidence = -np.inf if diverged else log_sum - before
+    return Stepped(kept, estimate, effective, evidence, resampled, diverged, all_outside)
 
 
 def _boxed(particles: InertialParticles, box: Box | None) -> tuple[InertialParticles, bool]:
