@@ -25,7 +25,12 @@ from app.tracking.constraints import ALTIMETER_VARIANCE_M2, Box, altimeter_log_l
 from app.tracking.field_likelihood import neutral
 from app.tracking.field_lookup import FieldTable, field_table, look_up
 from app.tracking.particle_filter import (
-    RESAMPLE_BELOW, Estimate, effective_sample_size, needs_resampling, normalise, systematic_ancestors,
+    RESAMPLE_BELOW,
+    Estimate,
+    effective_sample_size,
+    needs_resampling,
+    normalise,
+    systematic_ancestors,
 )  # fmt: skip
 
 __all__ = [
