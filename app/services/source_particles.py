@@ -1,11 +1,12 @@
 """The bootstrap particle filter of the sources, on steps of a device that reckons its own displacement."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from app.geometry import Array
-from app.services.filter_floors import OFF_FLOOR_M, Floor, Moved, moves, own_state, radius_95_m
+from app.services.filter_floors import OFF_FLOOR_M, Floor, moves, own_state, radius_95_m
 from app.services.followed_walks import Rows, Start, ToldWhat, rows_of
 from app.tracking.field_likelihood import log_likelihood, neutral, turned
 from app.tracking.field_lookup import look_up
@@ -23,6 +24,7 @@ X, Y, HEADING, SCALE, Z, FLOOR = range(6)
 class SourceParticles:
     """Uniform over measured cells and, without a compass, over headings; the map's variance is in the weight.
 
+    It moves when a reading is compared, and between readings its place is carried on by the mean heading and scale.
     Its place is the weighted mean on the floor that most of the weight is on. `jitter_sd` is of its state: x, y,
     heading, scale, height, floor.
     """
@@ -39,14 +41,16 @@ class SourceParticles:
     def follow_walk(self, steps: tuple[Step, ...], start: Start) -> Rows:
         rng = np.random.default_rng(self.seed)
         cloud = self._anywhere(steps[0], rng)
-        said = []
+        said, since_m, since_s, last = [], np.zeros(3), 0.0, self._says(cloud)
         for move in moves(steps, self.floors[0].apart_m):
-            if move.moved_m.any():
-                cloud = Particles(self._moved(cloud.state, move, rng), cloud.log_weight)
+            since_m, since_s = since_m + move.moved_m, since_s + move.elapsed_s
             if move.compared:
+                if since_m.any():
+                    cloud = Particles(self._moved(cloud.state, since_m, since_s, rng), cloud.log_weight)
                 likely = self._log_likelihood(cloud, move.step)
                 cloud = update(cloud, likely, rng, jitter_sd=np.array(self.jitter_sd)).particles
-            said.append(self._says(cloud))
+                since_m, since_s, last = np.zeros(3), 0.0, self._says(cloud)
+            said.append((last.floor, last.position_m + last.turn @ since_m[:2], last.covariance_m2, last.state))
         floor, position, covariance, says = (list(each) for each in zip(*said, strict=True))
         return rows_of(steps, floor, position, covariance, says)
 
@@ -66,11 +70,11 @@ class SourceParticles:
         state[:, SCALE] = 1.0 + self.options.step_scale_sd * rng.standard_normal(self.particles)
         return Particles.equal(state)
 
-    def _moved(self, state: Array, move: Moved, rng: np.random.Generator) -> Array:
-        plane = self.motion.propagate(state[:, :Z], move.moved_m[:2], rng, move.elapsed_s)
-        height, floor = state[:, Z] + move.moved_m[2], state[:, FLOOR]
+    def _moved(self, state: Array, moved_m: Array, elapsed_s: float, rng: np.random.Generator) -> Array:
+        plane = self.motion.propagate(state[:, :Z], moved_m[:2], rng, elapsed_s)
+        height, floor = state[:, Z] + moved_m[2], state[:, FLOOR]
         heights = np.array([each.height_m for each in self.floors])
-        if move.moved_m[2] != 0.0 and len(set(heights)) == len(heights):
+        if moved_m[2] != 0.0 and len(set(heights)) == len(heights):
             floor = np.argmin(np.abs(height[:, None] - heights), axis=1).astype(np.float64)
         return np.column_stack([plane, height, floor])
 
@@ -86,7 +90,7 @@ class SourceParticles:
             measured[here] = looked.measured & (np.abs(state[here, Z] - each.height_m) <= OFF_FLOOR_M)
         return neutral(log_l, measured, cloud.log_weight)
 
-    def _says(self, cloud: Particles) -> tuple[int, Array, Array, str]:
+    def _says(self, cloud: Particles) -> "_Said":
         weight, floor = normalise(cloud.log_weight).weight, cloud.state[:, FLOOR]
         best = int(np.argmax(np.bincount(floor.astype(np.int64), weights=weight)))
         here = floor == best
@@ -94,4 +98,16 @@ class SourceParticles:
         found = estimate(cloud.state[here, :2], weight[here] / share)
         sure = share >= self.options.converged_probability
         radius_m = radius_95_m(found.covariance) if sure else np.inf
-        return best, found.mean, found.covariance, own_state(radius_m, self.options)
+        turn = weight[here] * cloud.state[here, SCALE] @ np.exp(1j * cloud.state[here, HEADING]) / share
+        rotation = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+        return _Said(best, found.mean, found.covariance, own_state(radius_m, self.options), rotation)
+
+
+class _Said(NamedTuple):
+    """The belief at a reading; turn (2, 2) carries the place on by displacements until the next one."""
+
+    floor: int
+    position_m: Array
+    covariance_m2: Array
+    state: str
+    turn: Array
