@@ -25,6 +25,7 @@ class SourceParticles:
     """Uniform over measured cells and, without a compass, over headings; the map's variance is in the weight.
 
     It moves when a reading is compared, and between readings its place is carried on by the mean heading and scale.
+    Where nothing is mapped a reading is as likely as a draw from the map's prior; between floors it tells nothing.
     Its place is the weighted mean on the floor that most of the weight is on. `jitter_sd` is of its state: x, y,
     heading, scale, height, floor.
     """
@@ -81,14 +82,14 @@ class SourceParticles:
     def _log_likelihood(self, cloud: Particles, step: Step) -> Array:
         assert step.B_uT is not None
         state, n = cloud.state, len(cloud)
-        log_l, measured = np.zeros(n), np.zeros(n, dtype=np.bool_)
+        log_l, on_floor = np.zeros(n), np.zeros(n, dtype=np.bool_)
         for k, each in enumerate(self.floors):
             here = np.flatnonzero(state[:, FLOOR] == k)
             looked = look_up(each.table, state[here][:, [X, Y, Z]])
             reading = turned(step.B_uT, state[here, HEADING])
             log_l[here] = log_likelihood(looked, reading, each.variance_uT2(self.options))
-            measured[here] = looked.measured & (np.abs(state[here, Z] - each.height_m) <= OFF_FLOOR_M)
-        return neutral(log_l, measured, cloud.log_weight)
+            on_floor[here] = np.abs(state[here, Z] - each.height_m) <= OFF_FLOOR_M
+        return neutral(log_l, on_floor, cloud.log_weight)
 
     def _says(self, cloud: Particles) -> "_Said":
         weight, floor = normalise(cloud.log_weight).weight, cloud.state[:, FLOOR]
