@@ -30,7 +30,7 @@ def print_tracks(console: Console, found: TrackEvaluation, summaries: Summaries)
         "are taken to say so where their 95 % radius is at most 2.5 m. Lost: converged, but not at the end. NEES: "
         "squared error over its covariance while converged on the right floor, two on average for a filter that knows "
         "how good it is; in brackets what 95 % of the means of as many independent values as there are walks lie "
-        "within.",
+        "within; metres without error are said with a covariance of nothing, and not averaged.",
         highlight=False,
     )
 
@@ -83,10 +83,11 @@ def _claims_table(summaries: Summaries) -> Table:
 
 def _consistency_table(summaries: Summaries) -> Table:
     table = _table("Floors and consistency", "floor changes", f"found within {CHANGED_WITHIN_M:g} m", "said",
-                   "NEES mean (95 % of means)", "NEES median", "walks with NEES")  # fmt: skip
+                   "NEES mean (95 % of means)", "NEES median", "walks with NEES", "metres without error")  # fmt: skip
     for each in summaries:
         table.add_row(*_head(each), str(each.floor_changes), _share(each.floor_changes_found, each.floor_changes),
-                      str(each.floor_changes_made), *_nees(each), str(each.nees.walks))  # fmt: skip
+                      str(each.floor_changes_made), *_nees(each), str(each.nees.walks),
+                      str(each.nees.infinite))  # fmt: skip
     return table
 
 

@@ -13,6 +13,9 @@ __all__ = ["CHANGED_WITHIN_M", "JudgedTrack", "judge_track"]
 CHANGED_WITHIN_M = 10.0
 """Walked after a change of floor, until the filter has to say so."""
 
+LEAST_SD_M = 1e-3
+"""A covariance that is smaller, or none at all, says that the place is known without error."""
+
 
 @dataclass(frozen=True, slots=True)
 class JudgedTrack:
@@ -21,7 +24,7 @@ class JudgedTrack:
     error_m              at 0, 1, 2 ... metres truly walked; infinite on a wrong floor or where nothing is said
     state                there, in words
     nees                 there: squared error over its covariance, chi-square of two degrees of freedom if the filter is
-                         consistent; NaN on a wrong floor and where nothing is said
+                         consistent; NaN on a wrong floor and where nothing is said, infinite where no error is admitted
     converged_m, converged_s   walked and passed until the filter first said "converged"; None: never
     floor_changes, found, made   how often the device truly changed floors, how many of those the filter said
                          CHANGED_WITHIN_M later, and how many changes it said after it had converged
@@ -84,6 +87,9 @@ def _errors(walk: WalkToFollow, rows: Rows) -> tuple[Array, Array]:
     error_m, nees = np.full(len(right), np.inf), np.full(len(right), np.nan)
     error_m[right] = np.linalg.norm(off_m[right], axis=1)
     known = right & np.isfinite(rows.covariance_m2).all(axis=(1, 2))
+    sure = known.copy()
+    sure[known] = np.linalg.eigvalsh(rows.covariance_m2[known])[:, 0] < LEAST_SD_M**2
+    nees[sure], known = np.inf, known & ~sure
     whitened = np.linalg.solve(rows.covariance_m2[known], off_m[known][..., None])[..., 0]
     nees[known] = np.sum(off_m[known] * whitened, axis=1)
     return error_m, nees

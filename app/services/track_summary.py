@@ -1,5 +1,6 @@
 """Judged tracks as rates and percentiles by filter, with standard errors that count walks as independent."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -28,13 +29,14 @@ class Nees:
     """Of metres said with "converged" on the right floor: mean (two, if consistent), median (1.39), and an interval.
 
     It holds 95 % of the means of as many independent values as there are walks. Metres of a walk hang together,
-    but a walk is worth one value at least: the interval is rather too wide.
+    but a walk is worth one value at least: the interval is rather too wide. Infinite ones are counted, not averaged.
     """
 
     mean: Estimate | None
     median: float | None
     band: tuple[float, float] | None
     walks: int
+    infinite: int
 
     @property
     def consistent(self) -> bool:
@@ -78,10 +80,10 @@ class FilterSummary:
 
 
 def summarise_tracks(tracks: Tracks, false_beyond_m: Sequence[float]) -> list[FilterSummary]:
-    """Over all walks and over covered ones, filter by filter."""
+    """Over all walks and over covered ones, filter by filter; once, where all walks are covered."""
     names = list(dict.fromkeys(track.filter for track in tracks))
     out = []
-    for covered_only in (False, True):
+    for covered_only in (True,) if all(track.covered for track in tracks) else (False, True):
         for name in names:
             chosen = [t for t in tracks if t.filter == name and (t.covered or not covered_only)]
             if chosen:
@@ -169,11 +171,13 @@ def nees_band(walks: int) -> tuple[float, float]:
 def _nees(tracks: Tracks) -> Nees:
     sure = {id(t): [x for state, x in zip(t.state, t.nees, strict=True) if state == "converged" and np.isfinite(x)]
             for t in tracks}  # fmt: skip
+    metres = [pair for t in tracks for pair in zip(t.state, t.nees, strict=True)]
+    infinite = sum(state == "converged" and math.isinf(x) for state, x in metres)
     told = [t for t in tracks if sure[id(t)]]
     if not told:
-        return Nees(None, None, None, 0)
+        return Nees(None, None, None, 0, infinite)
     mean = _drawn(told, lambda chosen: float(np.mean(np.concatenate([sure[id(t)] for t in chosen]))))
-    return Nees(mean, _median([x for t in told for x in sure[id(t)]]), nees_band(len(told)), len(told))
+    return Nees(mean, _median([x for t in told for x in sure[id(t)]]), nees_band(len(told)), len(told), infinite)
 
 
 def _median(values: Sequence[float]) -> float:

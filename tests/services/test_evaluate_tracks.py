@@ -65,6 +65,17 @@ def test_scores_of_hand_made_rows():
     assert (track.length_m, track.duration_s) == (20.0, 20.0)
 
 
+def test_a_covariance_of_nothing_is_infinitely_sure():
+    walk = straight()
+    rows = said(walk, np.full(41, 1.0), ["converged"] * 41)
+    rows.covariance_m2[10] = [[1e-40, 0.0], [0.0, 1.0]]
+    track = judge_track("x", "nothing", walk, rows, 1.0)
+    assert track.nees[5] == np.inf
+    (summary,) = summarise_tracks([track], (5.0,))
+    assert (summary.nees.infinite, summary.nees.mean.value) == (1, pytest.approx(1.0))
+    assert summary.nees.consistent
+
+
 def test_a_wrong_floor_is_infinitely_wrong_and_changes_are_counted():
     n = 81
     walk = straight(n, floors=np.where(np.arange(n) < 30, 0, 1))
