@@ -303,10 +303,12 @@ def test_a_folder_without_floors_is_refused(tmp_path):
 @pytest.mark.timeout(1500)
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"real walks are not at {REAL}: set ISODYN_TEST_DATA")
 def test_real_walks_are_followed_better_by_the_map_than_by_chance(tmp_path):
-    (tmp_path / "F2").symlink_to((REAL / "F2").resolve())
+    (tmp_path / "F1").symlink_to((REAL / "F1").resolve())
     tracks = evaluate_tracks(tmp_path, TrackPlan(particles=5000), lambda *_: None).tracks
-    ours = [track for track in tracks if track.filter == "adaptive"]
-    assert len(ours) >= 3
-    assert {track.filter for track in tracks} >= {"dead reckoning", "Kalman, ML fixes"}
-    claimed = [x for track in ours for x, state in zip(track.error_m, track.state, strict=True) if state == "converged"]
-    assert not claimed or np.median(claimed) < 10.0
+    ends = {
+        name: [t.end_error_m for t in tracks if t.filter == name and t.covered]
+        for name in ("adaptive", "dead reckoning")
+    }
+    assert len(ends["adaptive"]) >= 5
+    assert np.mean(np.array(ends["adaptive"]) <= 5.0) > 0.3  # by chance: .01
+    assert np.mean(np.array(ends["dead reckoning"]) <= 5.0) > 0.5
