@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install install-dev demo serve test test-slow lint format benchmarks evaluate gallery openapi lock clean
+.PHONY: help install install-dev demo serve test test-slow lint format benchmarks evaluate evaluate-tracks gallery openapi lock clean
 
 help: ## Explain every target
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -56,6 +56,9 @@ benchmarks: install-dev ## Measure every performance claim; each prints both sid
 
 evaluate: install ## Evaluate on real walks: make evaluate DIR=path/to/site
 	$(BIN)/isodyn evaluate $(DIR)
+
+evaluate-tracks: install ## Follow real walks: make evaluate-tracks DIR=path/to/site
+	$(BIN)/isodyn evaluate tracks $(DIR)
 
 gallery: install-dev ## Make the documentation's pictures of the page anew, by its browser tests
 	ISODYN_GALLERY=1 $(BIN)/python -m pytest tests/browser

@@ -2,7 +2,8 @@
 
 import typer
 
-from app.cli import client, demo, doctor, evaluate, keys, serve, view
+from app.cli import client, demo, doctor, evaluate, evaluate_tracks, keys, serve, view
+from app.cli.default_group import DEFAULT, DefaultGroup
 
 __all__ = ["main"]
 
@@ -20,7 +21,12 @@ main.command()(client.ingest)
 main.command()(client.locate)
 main.command()(client.export)
 main.command()(view.view)
-main.command()(evaluate.evaluate)
+evaluations = typer.Typer(cls=DefaultGroup, help="How good maps and fixes are on real walks, and tracks.")
+evaluations.command(DEFAULT, hidden=True, epilog="`isodyn evaluate tracks` follows walks step by step.")(
+    evaluate.evaluate
+)
+evaluations.command("tracks")(evaluate_tracks.tracks)
+main.add_typer(evaluations, name="evaluate")
 main.add_typer(keys.commands, name="keys")
 main.command()(doctor.doctor)
 main.command()(serve.openapi)

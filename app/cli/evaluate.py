@@ -1,14 +1,14 @@
 """`isodyn evaluate`: how good maps and fixes are on a folder of real walks, as tables and as JSON."""
 
-import json
-import math
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from app.cli.plain_json import write_json
+from app.cli.progress import bars
 
 if TYPE_CHECKING:
     from app.services.cross_validate_maps import CrossValidation
@@ -80,16 +80,8 @@ def evaluate(
         processes=processes,
     )
     errors = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     try:
-        with Progress(*columns, console=errors) as progress:
-            bars: dict[str, Any] = {}
-
-            def told(stage: str, done: int, total: int) -> None:
-                if stage not in bars:
-                    bars[stage] = progress.add_task(stage, total=total)
-                progress.update(bars[stage], completed=done)
-
+        with bars(errors) as told:
             judge = cross_validate_maps if maps else evaluate_walks
             found: Evaluation | CrossValidation = judge(directory, plan, told)
     except IsodynError as error:
@@ -100,13 +92,4 @@ def evaluate(
     print_evaluation(console if console.is_terminal else Console(width=_FILE_WIDTH), found, summaries, disc_m)
     if json_file is not None:
         document = {"evaluation": asdict(found), "summaries": [asdict(summary) for summary in summaries]}
-        json_file.write_text(json.dumps(_finite(document), indent=1, allow_nan=False) + "\n")
-
-
-def _finite(value: Any) -> Any:
-    """Plain JSON: null for what is infinite or not a number."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        write_json(json_file, document)

@@ -8,24 +8,19 @@ turn, and windows of all of them are judged. Floors and windows run in child pro
 
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from app.field.body_bias import BodyBias
-from app.field.fit import fit_map
 from app.field.grid import FieldGrid
-from app.field.samples import Samples
-from app.field.session_bias import estimate_session_biases
 from app.field.spec import FittedMap, MapSpec, Noise, Score
 from app.geometry import Array
+from app.services.fold_maps import MappingPlan, map_fold, places_m
 from app.services.held_out_walks import (
     HELD_OUT_EVERY,
     Told,
-    calibrate_sessions,
     collected,
     hold_out,
     on_one_thread,
@@ -110,24 +105,12 @@ def _numbered(told: Told, fold: int) -> Told:
 def _evaluate_fold(
     floors: Mapping[str, Mapping[str, Walk]], fold: int, plan: EvaluationPlan, told: Told
 ) -> tuple[list[EvaluatedFloor], list[JudgedWindow]]:
-    spec = replace(plan.spec, hard_iron=plan.session_bias)
-    mapping = {floor_id: {name: walks[name].samples for name in hold_out(walks, fold)[0]}
-               for floor_id, walks in floors.items()}  # fmt: skip
-    biases: dict[str, dict[str, BodyBias] | None] = dict.fromkeys(floors)
-    if plan.session_bias:
-        biases = {floor_id: estimate_session_biases(samples) for floor_id, samples in mapping.items()}
-        floors = {floor_id: calibrate_sessions(walks, biases[floor_id] or {}) for floor_id, walks in floors.items()}
     noises = (plan.spec.noise,) if plan.folds else NOISES
-    with ProcessPoolExecutor(plan.processes, get_context("spawn"), initializer=on_one_thread) as pool:
-        fits = {
-            pool.submit(_fit_floor, samples, replace(spec, noise=noise)): (floor_id, noise)
-            for floor_id, samples in mapping.items()
-            for noise in noises
-        }
-        by_noise = dict(collected(fits, told, "fitting maps"))
+    mapped = map_fold(floors, fold, MappingPlan(plan.spec, plan.session_bias, noises, plan.processes), told)
+    floors, mapping, biases, by_noise = mapped
     fitted = {floor_id: by_noise[floor_id, plan.spec.noise] for floor_id in floors}
     tasks = [
-        (floor_id, name, floors[floor_id][name], _places_m(mapping[floor_id]))
+        (floor_id, name, floors[floor_id][name], places_m(mapping[floor_id]))
         for floor_id in floors
         for name in hold_out(floors[floor_id], fold)[1]
     ]
@@ -141,10 +124,6 @@ def _evaluate_fold(
         _evaluated_floor(floor_id, walks, fitted[floor_id], by_noise[floor_id, "white"], biases[floor_id])
         for floor_id, walks in floors.items()
     ], windows
-
-
-def _fit_floor(walks: Mapping[str, Samples], spec: MapSpec) -> FittedMap:
-    return fit_map(walks, spec)
 
 
 _ready: list[tuple[Floors, Question]] = []
@@ -161,11 +140,6 @@ def _judge_walk(floor_id: str, name: str, walk: Walk, mapped_m: Array) -> list[J
     return judge_walk(floors, floor_id, name, walk, mapped_m, question)
 
 
-def _places_m(walks: Mapping[str, Samples]) -> Array:
-    """(n, 2) positions of walks."""
-    return np.concatenate([samples.p_building_m[:, :2] for samples in walks.values()])
-
-
 def _evaluated_floor(
     floor_id: str,
     walks: Mapping[str, Walk],
@@ -174,7 +148,7 @@ def _evaluated_floor(
     biases: Mapping[str, BodyBias] | None,
 ) -> EvaluatedFloor:
     mapping, held_out = hold_out(walks)
-    mapped_m = _places_m({name: walks[name].samples for name in mapping})
+    mapped_m = places_m({name: walks[name].samples for name in mapping})
 
     def against(grid: FieldGrid) -> list[HeldOutWalk]:
         samples = [walks[name].samples for name in held_out]
