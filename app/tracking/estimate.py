@@ -70,7 +70,8 @@ def describe(particles: Particles, weight: Array, floors: int, map_variance_m2: 
         here = particles.floor == best.floor
         rows, w = rows[here], weight[here] / weight[here].sum()
     off = rows[:, :2] - np.array(best.position_m[:2])
-    covariance = (w[:, None] * off).T @ off + map_variance_m2 * np.eye(2)
+    drawn_m2 = _BIN_M**2 * float(np.sum(np.square(w)))  # a few particles know their spread badly
+    covariance = (w[:, None] * off).T @ off + (map_variance_m2 + drawn_m2) * np.eye(2)
     distance = np.hypot(off[:, 0], off[:, 1])
     order = np.argsort(distance, kind="stable")
     held = np.cumsum(w[order])

@@ -47,8 +47,8 @@ class TrackOptions:
     bias_sd_uT: float = 0.5
     step_scale_sd: float = 0.05
     heading_drift_sd_rad_per_m: float = 0.003
-    heading_walk_rad: float = 0.02
-    position_walk_m: float = 0.06
+    heading_walk_rad: float = 0.015
+    position_walk_m: float = 0.05
     course_sd_rad: float = 0.05
     course_m: float = 5.0
     scale_m: float = 100.0

@@ -21,8 +21,8 @@ from app.tracking.particle_filter import normalise, systematic_ancestors
 from app.tracking.places import Places
 
 __all__ = [
-    "COLUMNS", "COURSE", "DRAWS", "DRIFT", "HEADING", "MEASURED", "SCALE", "X", "Y", "Z", "Advance", "Particles",
-    "advance", "log_evidence", "new_particles", "resample", "weights",
+    "BETWEEN_FLOORS_M", "COLUMNS", "COURSE", "DRAWS", "DRIFT", "HEADING", "MEASURED", "SCALE", "X", "Y", "Z", "Advance",
+    "Particles", "advance", "log_evidence", "new_particles", "resample", "weights",
 ]  # fmt: skip
 
 X, Y, Z, HEADING, COURSE, SCALE, DRIFT, MEASURED = 0, 1, 2, 3, 4, 5, 6, 7
@@ -30,7 +30,7 @@ _BB, _BV, _BF, _VV, _VF, _FF, _B, _V, _F = 8, 9, 10, 11, 12, 13, 14, 17, 20
 COLUMNS = 23
 DRAWS = 5
 _CROSSING = 8.0  # nats that a path through a wall costs: plans err, too
-_BETWEEN_FLOORS_M = 1.0  # this far above or below the map of a floor nothing is mapped
+BETWEEN_FLOORS_M = 1.0  # this far above or below the map of a floor nothing is mapped
 _MEASURED_M = 5.0  # over which "measured" is remembered
 
 
@@ -131,6 +131,12 @@ def _advance(  # type: ignore[no-untyped-def]
         if not observed:
             continue
         variance, measured = _look_up(x, y, row[Z], floor[i], cells, planes, shapes, floors, resolution, c, mean)
+        below, above = floors[floor[i], 0], floors[floor[i], 0] + floors[floor[i], 1] - 1
+        on_floor = planes[below, 2] - BETWEEN_FLOORS_M < row[Z] < planes[above, 2] + BETWEEN_FLOORS_M
+        if on_floor:
+            log_weight[i] -= strays * (1.0 - measured)
+        else:
+            measured = 0.0
         row[MEASURED] = forget * row[MEASURED] + (1.0 - forget) * measured
         sigma = np.sqrt(errors[0] * variance)
         spread = errors[3] * np.sqrt(max(1.0 - measured, 0.0))
@@ -162,7 +168,7 @@ def _advance(  # type: ignore[no-untyped-def]
             row[_V + k] = v_k + gain_v * y_k
             row[_F + k] = f_k + gain_f * y_k
             squares += y_k * y_k
-        log_weight[i] -= 0.5 * (squares / total + c * np.log(6.283185307179586 * total)) + strays * (1.0 - measured)
+        log_weight[i] -= 0.5 * (squares / total + c * np.log(6.283185307179586 * total))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -179,7 +185,6 @@ def _look_up(x, y, z, floor, cells, planes, shapes, floors, resolution, c, mean)
     for k in range(c):
         mean[k] = 0.0
     variance, measured = 0.0, 0.0
-    on_floor = planes[first, 2] - _BETWEEN_FLOORS_M < z < planes[first + count - 1, 2] + _BETWEEN_FLOORS_M
     width = c + 2
     for layer in range(2):
         plane, part = (below, 1.0 - share) if layer == 0 else (above, share)
@@ -198,7 +203,7 @@ def _look_up(x, y, z, floor, cells, planes, shapes, floors, resolution, c, mean)
             for k in range(c):
                 mean[k] += w * cells[at + k]
             variance += w * cells[at + c]
-            if on_floor and a == j + dj and b == i + di:
+            if a == j + dj and b == i + di:
                 measured += w * cells[at + c + 1]
     return variance, measured
 

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from app.geometry import Array
 from app.tracking.ground import Connector
-from app.tracking.particles import Particles, Z
+from app.tracking.particles import BETWEEN_FLOORS_M, Particles, Z
 from app.tracking.places import Places
 
-__all__ = ["settle_heights", "through_connectors"]
+__all__ = ["settle_heights", "share_between_floors", "through_connectors"]
 
 LEVELS_OUT_M = 10.0  # walked along a floor, until a reckoned height is forgotten for the floor's own
 STAIRS_M = 4.0  # walked on stairs, until one is likely on another floor
@@ -28,6 +29,13 @@ def settle_heights(particles: Particles, places: Places, distance_m: float, rise
     at = np.where(high > low, np.clip(rows[:, Z], low, high), height)  # a map of several heights holds between them
     rows[:, Z] = at + level * (rows[:, Z] - at)
     return replace(particles, rows=rows, floor=floor)
+
+
+def share_between_floors(particles: Particles, weight: Array, places: Places) -> float:
+    """Of the belief, that is on the way from floor to floor, where no map tells anything."""
+    z, floor = particles.rows[:, Z], particles.floor
+    beyond = np.maximum(places.lowest_m[floor] - z, z - places.highest_m[floor])
+    return float(weight @ (beyond > BETWEEN_FLOORS_M))
 
 
 def through_connectors(

@@ -40,7 +40,7 @@ from app.tracking.resampling import enough
 from app.tracking.smoother import Node, Smoothed, empty_lag, inherit, remember, settle
 from app.tracking.start import spread, walkable_cells
 from app.tracking.step import Step
-from app.tracking.storeys import settle_heights, through_connectors
+from app.tracking.storeys import settle_heights, share_between_floors, through_connectors
 from app.tracking.track_state import MOST_ODDS, Tracker, TrackState
 
 __all__ = ["Followed", "TrackState", "Tracker", "begin", "follow", "make_tracker"]
@@ -180,6 +180,8 @@ def _weigh(
     particles = replace(particles, log_weight=particles.log_weight - gained)
     particles = _on_floors(tracker, state, particles, before, reading, move, rng)
     walked, lost = state.gains[-1]
+    if share_between_floors(particles, weight, tracker.places) > 0.5:
+        gained = -lost  # on stairs neither the map nor its absence tells anything
     gains = (*state.gains[:-1], (walked, lost + gained))
     log_odds = min(state.log_odds + lost + gained, MOST_ODDS)
     lag = remember(state.lag, Node(reading.number, reading.t_s, state.path_m), particles)
