@@ -104,11 +104,11 @@ def begin() -> TrackState:
 def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
     """One step on. Raises InvalidInput for a step that is not after the last one."""
     _check(state, step)
-    rng = np.random.Generator(np.random.Philox(key=[tracker.seed, step.number]))
     state = moved_on(tracker, state, step)
     reading, state = gathered(tracker, state, step)
     if reading is None:
         return _followed(replace(state, step=step), ())
+    rng = np.random.Generator(np.random.Philox(key=[tracker.seed, step.number]))
     said, recent = state.estimate, state.recent
     before = recent.readings[-1] if recent.readings else None
     if before is not None and abs(reading.displacement_m[2] - recent.readings[0].displacement_m[2]) > STOREY_M:
