@@ -30,6 +30,7 @@ def test_a_wrong_key_is_told_so_and_a_right_one_sees_the_building(seat, town):
     me.page.get_by_label("API key").wait_for()
 
 
+@pytest.mark.slow
 def test_every_layer_is_another_picture_with_its_own_legend(seat, town):
     me = seat().open(f"?floor={town.floors[0]}")
     select = me.page.get_by_label("Layer")
@@ -125,6 +126,7 @@ def test_a_dropped_window_is_located_with_its_likelihood(seat, town):
     expect(answer.get_by_role("alert")).to_contain_text("b_ut")
 
 
+@pytest.mark.slow
 def test_a_walk_is_replayed_against_its_truth(seat, town):
     lines = gzip.decompress(town.world.floors[0].surveys[0].gzipped).decode().splitlines(keepends=True)
     me = seat().open(f"?floor={town.floors[0]}")
@@ -149,6 +151,7 @@ def test_a_walk_is_replayed_against_its_truth(seat, town):
     expect(me.page.locator("#replay").get_by_role("alert")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_two_people_do_not_move_each_other(seat, town):
     mine, yours = seat().open(f"?floor={town.floors[0]}"), seat().open(f"?floor={town.floors[0]}")
     before = mine.settled()
@@ -266,6 +269,7 @@ def test_a_floor_plan_is_laid_under_the_map(seat, town, tmp_path):
     assert town.api.get(f"/v1/floors/{town.floors[1]}").json()["plan"] is None
 
 
+@pytest.mark.slow
 def test_a_session_that_ends_leads_back_to_signing_in(seat, town):
     me = seat().open()
     cookie = me.page.context.cookies()[0]

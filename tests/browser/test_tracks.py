@@ -70,6 +70,7 @@ def _said(estimate: dict[str, Any]) -> str:
     return f"x {x:.2f} m, y {y:.2f} m"
 
 
+@pytest.mark.slow
 def test_a_device_is_seen_as_it_is_found_and_goes_on(seat, town, begin, steps):
     me = seat().open(f"?floor={town.floors[0]}")
     me.page.get_by_label("Field arrows").uncheck()

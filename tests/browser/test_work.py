@@ -55,6 +55,7 @@ def test_a_dropped_survey_becomes_part_of_the_map_and_can_be_left_out_again(seat
     assert town.map_of(1) == second
 
 
+@pytest.mark.slow
 def test_a_bad_survey_is_refused_with_where_and_why(seat, town):
     me = seat().open(f"?floor={town.floors[0]}")
     me.tab("Surveys")

@@ -27,7 +27,7 @@ def _floor_with_surveys(server: Any, walk_csv: Callable[[int], bytes]) -> str:
     return str(floor)
 
 
-@pytest.mark.parametrize("victim", ["worker and fit", "everything"])
+@pytest.mark.parametrize("victim", ["everything", pytest.param("worker and fit", marks=pytest.mark.slow)])
 def test_a_fit_survives_kill_9_and_its_map_is_identical(
     server: Any, walk_csv: Callable[[int], bytes], victim: str
 ) -> None:

@@ -240,6 +240,7 @@ def test_a_window_off_the_map_is_unmapped(world: FieldGrid, rng: np.random.Gener
     assert fix.posterior.off_map_probability > 0.5
 
 
+@pytest.mark.slow
 def test_a_window_much_longer_than_the_map_is_unmapped(world: FieldGrid, rng: np.random.Generator) -> None:
     displacement = np.column_stack([np.linspace(0, 300, 60), np.zeros((60, 2))])
     B = world.ambient_uT + 4.0 * rng.normal(size=(60, 3))

@@ -88,6 +88,7 @@ def test_folds_hold_every_walk_out_once():
     assert sorted(held_out) == sorted(names)
 
 
+@pytest.mark.slow
 def test_every_walk_judges_the_maps_once(building):
     found = cross_validate_maps(building, EvaluationPlan(processes=1), lambda *_: None)
     assert [floor.floor_id for floor in found.floors] == ["F0", "F1", "all"]
@@ -248,6 +249,7 @@ def test_prior_positions_are_spread_evenly_over_their_disc():
     np.testing.assert_array_equal(disc_centre_m(truth_m, 20.0, "7"), truth_m + drawn[7])
 
 
+@pytest.mark.slow
 def test_every_walk_is_asked_once_where_all_folds_are_held_out(building, tmp_path):
     report = tmp_path / "report.json"
     asked = [str(building), "--folds", "--length", "10", "--processes", "1", "--json", str(report)]
