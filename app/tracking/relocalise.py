@@ -62,12 +62,11 @@ def _taken(tracker: Tracker, state: TrackState, found: Found, rng: np.random.Gen
 def doubtful(tracker: Tracker, state: TrackState) -> bool:
     """Whether it is time to look elsewhere. A window needs to know how it was walked."""
     walked = state.path_m - state.searched_m
-    reckoned = not any(reading.unseen_m for reading in state.recent.readings)
     return (
-        reckoned
+        state.probability < DOUBT
         and walked >= SEARCH_AGAIN_M
         and state.recent.length_m > LONG_ENOUGH * tracker.options.window_m
-        and state.probability < DOUBT
+        and not any(reading.unseen_m for reading in state.recent.readings)
     )
 
 
