@@ -228,7 +228,7 @@ def test_all_of_it_works_by_keyboard(seat, town):
     assert unnamed == []
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 720), (820, 1180)])
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), pytest.param(820, 1180, marks=pytest.mark.slow)])
 def test_it_fits_a_small_screen_and_a_tablet(seat, town, width, height):
     me = seat(width=width, height=height).open(f"?floor={town.floors[0]}")
     picture = me.settled()

@@ -9,6 +9,7 @@ from playwright.sync_api import expect
 pytestmark = pytest.mark.browser
 
 
+@pytest.mark.slow
 def test_a_dropped_survey_becomes_part_of_the_map_and_can_be_left_out_again(seat, town):
     floor = town.floors[1]
     lines = gzip.decompress(town.world.floors[1].surveys[0].gzipped).decode().splitlines(keepends=True)

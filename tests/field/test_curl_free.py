@@ -121,6 +121,7 @@ def test_a_field_longer_than_the_boxes_is_not_taken_for_offsets(building):
     assert covered(fitted, building, 1.2) > 0.85
 
 
+@pytest.mark.slow
 def test_a_constant_field_is_a_map(at_one_height):
     B_uT = np.array([18.0, 3.0, -42.0])
     walks = {
