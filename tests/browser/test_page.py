@@ -70,6 +70,7 @@ def test_walks_arrows_and_outline_come_and_go(seat, town):
             me.keep("walks")
 
 
+@pytest.mark.slow
 def test_a_clicked_value_is_the_apis(seat, town):
     me = seat().open(f"?floor={town.floors[1]}")
     me.page.get_by_role("button", name="From above").click()
@@ -100,6 +101,7 @@ def test_a_clicked_value_is_the_apis(seat, town):
     expect(picked).to_contain_text("not measured")
 
 
+@pytest.mark.slow
 def test_a_dropped_window_is_located_with_its_likelihood(seat, town):
     question = next(q for q in town.world.questions if q.floor == 0 and q.length_m == 2.0)
     me = seat().open(f"?floor={town.floors[0]}")

@@ -99,6 +99,7 @@ def test_every_walk_judges_the_maps_once(building):
     assert np.isfinite(everything.nlpd_gain_over_white.value)
 
 
+@pytest.mark.slow
 def test_the_command_judges_maps_alone_when_asked(building):
     result = CliRunner().invoke(_application(), [str(building), "--maps", "--processes", "1"])
     assert result.exit_code == 0, result.output
