@@ -83,9 +83,9 @@ def search_again(tracker: Tracker, state: TrackState, rng: np.random.Generator) 
     elsewhere = float(np.exp(log_odds[1] - mapped))
     if rng.uniform() >= elsewhere and elsewhere < 0.05:
         return state
-    if elsewhere > 0.95:
-        return _taken(tracker, state, found, rng)
     taken = _taken(tracker, state, found, rng)
+    if elsewhere > 0.95:
+        return taken
     assert taken.particles is not None
     assert taken.lag is not None
     return _mixed(tracker, state, taken, elsewhere)

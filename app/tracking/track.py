@@ -26,13 +26,7 @@ from app.tracking.moves import move_between, offset_variance_uT2
 from app.tracking.no_map import predict_without_map, without_map
 from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.particle_filter import needs_resampling, normalise
-from app.tracking.particles import (
-    DRAWS,
-    Advance,
-    Particles,
-    advance,
-    resample,
-)
+from app.tracking.particles import DRAWS, Advance, Particles, advance, resample
 from app.tracking.places import make_places
 from app.tracking.recent import Reading, Recent
 from app.tracking.relocalise import doubtful, search, search_again
@@ -115,16 +109,17 @@ def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
         recent = Recent()  # a window is walked on one floor
     recent = recent.with_reading(reading, state.path_m, tracker.options.window_m)
     state = replace(state, step=step, recent=recent)
-    state = _predict_nothing(tracker, state, before, reading)
+    move = move_between(before, reading, tracker.frame, tracker.places, tracker.options)
+    state = _predict_nothing(tracker, state, move)
     if state.particles is None:
         settled: tuple[Smoothed, ...] = ()
         if before is None and (tracker.prior is not None or step.displacement_m is None):
             state = _start_around(tracker, state, step, rng)
-            state, settled = _weigh(tracker, state, None, reading, rng)
+            state, settled = _weigh(tracker, state, move, before, reading, rng)
         else:
             state = search(tracker, state, rng)
     else:
-        state, settled = _weigh(tracker, state, before, reading, rng)
+        state, settled = _weigh(tracker, state, move, before, reading, rng)
         if doubtful(tracker, state):
             state = search_again(tracker, state, rng)
     if state.estimate is not said:
@@ -147,10 +142,9 @@ def _check(state: TrackState, step: Step) -> None:
         )
 
 
-def _predict_nothing(tracker: Tracker, state: TrackState, before: Reading | None, reading: Reading) -> TrackState:
+def _predict_nothing(tracker: Tracker, state: TrackState, move: Advance) -> TrackState:
     places, options = tracker.places, tracker.options
     nothing = state.no_map or without_map(places, offset_variance_uT2(places, options))
-    move = move_between(before, reading, tracker.frame, places, options)
     assert move.features_uT is not None
     nothing, log_density = predict_without_map(nothing, move.features_uT, move.distance_m, move.noise_uT2, places)
     kept = tuple(gain for gain in state.gains if gain[0] >= state.path_m - options.window_m)
@@ -167,13 +161,13 @@ def _start_around(tracker: Tracker, state: TrackState, step: Step, rng: np.rando
 
 
 def _weigh(
-    tracker: Tracker, state: TrackState, before: Reading | None, reading: Reading, rng: np.random.Generator
-) -> tuple[TrackState, tuple[Smoothed, ...]]:
+    tracker: Tracker, state: TrackState, move: Advance, before: Reading | None, reading: Reading,
+    rng: np.random.Generator,
+) -> tuple[TrackState, tuple[Smoothed, ...]]:  # fmt: skip
     """Particles moved to the reading, weighed by it, and resampled when few of them count."""
     assert state.particles is not None
     assert state.lag is not None
     options = tracker.options
-    move = move_between(before, reading, tracker.frame, tracker.places, options)
     noise = rng.standard_normal((len(state.particles), DRAWS), dtype=np.float32)
     particles = advance(state.particles, move, tracker.places, tracker.barriers, noise)
     weight, gained, _ = normalise(particles.log_weight)
