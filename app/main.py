@@ -26,6 +26,7 @@ from app.api import (
     maps,
     outlines,
     plans,
+    reference_field,
     replay,
     surveys,
     track_stream,
@@ -139,6 +140,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         maps,
         localizability,
         replay,
+        reference_field,
         jobs,
     ):
         app.include_router(part.router)

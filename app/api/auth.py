@@ -11,7 +11,17 @@ from app.api.context import Context, context_of
 from app.api.problems import Forbidden, Unauthorised
 from app.services.manage_keys import Identity
 
-__all__ = ["AdminOnly", "Identity", "Locating", "Reading", "SurveyReading", "SurveyWriting", "MapWriting", "recognised"]
+__all__ = [
+    "AdminOnly",
+    "Identity",
+    "Locating",
+    "Measuring",
+    "Reading",
+    "SurveyReading",
+    "SurveyWriting",
+    "MapWriting",
+    "recognised",
+]
 
 _bearer = HTTPBearer(auto_error=False, description="an API key, `isd_...`; `isodyn keys create` makes one")
 
@@ -45,3 +55,4 @@ MapWriting = Annotated[Identity, Depends(_needs("map:write"))]
 SurveyReading = Annotated[Identity, Depends(_needs("survey:write", "map:read", "map:write"))]
 SurveyWriting = Annotated[Identity, Depends(_needs("survey:write"))]
 Locating = Annotated[Identity, Depends(_needs("locate"))]
+Measuring = Annotated[Identity, Depends(_needs("survey:write", "map:read", "map:write", "locate"))]
