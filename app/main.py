@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from app import __version__
 from app.api import (
     buildings,
+    calibrations,
     floors,
     health,
     jobs,
@@ -141,6 +142,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         localizability,
         replay,
         reference_field,
+        calibrations,
         jobs,
     ):
         app.include_router(part.router)

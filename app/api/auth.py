@@ -13,6 +13,7 @@ from app.services.manage_keys import Identity
 
 __all__ = [
     "AdminOnly",
+    "Calibrating",
     "Identity",
     "Locating",
     "Measuring",
@@ -55,4 +56,5 @@ MapWriting = Annotated[Identity, Depends(_needs("map:write"))]
 SurveyReading = Annotated[Identity, Depends(_needs("survey:write", "map:read", "map:write"))]
 SurveyWriting = Annotated[Identity, Depends(_needs("survey:write"))]
 Locating = Annotated[Identity, Depends(_needs("locate"))]
+Calibrating = Annotated[Identity, Depends(_needs("survey:write", "locate"))]
 Measuring = Annotated[Identity, Depends(_needs("survey:write", "map:read", "map:write", "locate"))]

@@ -19,6 +19,7 @@ from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Building
 from app.errors import Fault, InvalidInput, InvalidWindow, NotFound
 from app.positioning.fix import Prior
+from app.services.calibrations import AppliedCalibration, find_calibration
 from app.services.locate_window import ActiveMap, active_maps, locate_window
 
 __all__ = ["router"]
@@ -36,14 +37,16 @@ async def locate_in_building(
     building_id: Id, body: LocateBody, context: ContextDep, identity: Locating, explain: Explain = False
 ) -> Response:
     """Every floor with an active map is searched, or those in `floor_ids`."""
-    return _json(await _in_turn(context, partial(_building_maps, context, identity, building_id), body, explain))
+    return _json(
+        await _in_turn(context, identity, partial(_building_maps, context, identity, building_id), body, explain)
+    )
 
 
 @router.post("/floors/{floor_id}/locate", response_model=FixView, summary="Locate a window on one floor")
 async def locate_on_floor(
     floor_id: Id, body: LocateBody, context: ContextDep, identity: Locating, explain: Explain = False
 ) -> Response:
-    return _json(await _in_turn(context, partial(_floor_maps, context, identity, floor_id), body, explain))
+    return _json(await _in_turn(context, identity, partial(_floor_maps, context, identity, floor_id), body, explain))
 
 
 @router.post(
@@ -53,22 +56,25 @@ async def locate_batch_in_building(
     building_id: Id, body: BatchBody, context: ContextDep, identity: Locating
 ) -> Response:
     find_maps = partial(_building_maps, context, identity, building_id)
-    return _json(BatchAnswer(fixes=[await _in_turn(context, find_maps, query) for query in body.queries]))
+    return _json(BatchAnswer(fixes=[await _in_turn(context, identity, find_maps, query) for query in body.queries]))
 
 
 @router.post("/floors/{floor_id}/locate:batch", response_model=BatchAnswer, summary="Locate many windows on one floor")
 async def locate_batch_on_floor(floor_id: Id, body: BatchBody, context: ContextDep, identity: Locating) -> Response:
     find_maps = partial(_floor_maps, context, identity, floor_id)
-    return _json(BatchAnswer(fixes=[await _in_turn(context, find_maps, query) for query in body.queries]))
+    return _json(BatchAnswer(fixes=[await _in_turn(context, identity, find_maps, query) for query in body.queries]))
 
 
 async def _in_turn(
-    context: Context, find_maps: Callable[[LocateBody], list[ActiveMap]], body: LocateBody, explain: bool = False
-) -> FixView:
+    context: Context, identity: Identity, find_maps: Callable[[LocateBody], list[ActiveMap]], body: LocateBody,
+    explain: bool = False,
+) -> FixView:  # fmt: skip
     """One window's answer, when its turn comes. A batch queues anew for each of its windows: others come in between."""
     start = perf_counter()
     loop = asyncio.get_running_loop()
-    return await loop.run_in_executor(context.searches, lambda: _locate(context, find_maps(body), body, start, explain))
+    return await loop.run_in_executor(
+        context.searches, lambda: _locate(context, identity, find_maps(body), body, start, explain)
+    )
 
 
 def _json(answer: BaseModel) -> Response:
@@ -94,14 +100,25 @@ def _floor_maps(context: Context, identity: Identity, floor_id: str, body: Locat
         return active_maps(connection, identity.organisation_id, floor_ids=[floor_id])
 
 
-def _locate(context: Context, maps: list[ActiveMap], body: LocateBody, start: float, explained: bool) -> FixView:
+def _calibration(context: Context, identity: Identity, body: LocateBody) -> AppliedCalibration | None:
+    window = body.window
+    if window.calibration_id is None and window.device is None:
+        return None
+    with context.transaction() as session:
+        return find_calibration(session, identity.organisation_id, window.calibration_id, window.device)
+
+
+def _locate(
+    context: Context, identity: Identity, maps: list[ActiveMap], body: LocateBody, start: float, explained: bool
+) -> FixView:
     if len(body.window.b_ut) > context.settings.max_window_samples:
         limit = context.settings.max_window_samples
         raise InvalidWindow(f"the window has more than {limit} samples", Fault("/body/window/b_ut", "send fewer"))
+    calibration = _calibration(context, identity, body)
     result = locate_window(
         maps,
         context.grids,
-        core_window(body.window),
+        core_window(body.window, None if calibration is None else calibration.model),
         composition=body.composition,
         techniques=body.techniques,
         prior=Prior((*body.prior.position_m,), body.prior.sd_m) if body.prior else None,  # type: ignore[arg-type]
@@ -109,4 +126,4 @@ def _locate(context: Context, maps: list[ActiveMap], body: LocateBody, start: fl
         explained=explained,
     )
     timing = Timing(search=result.search_ms, total=1e3 * (perf_counter() - start))
-    return show_fix(result.fix, body.techniques, list(result.map_ids), timing, result.explanation)
+    return show_fix(result.fix, body.techniques, list(result.map_ids), timing, result.explanation, calibration)

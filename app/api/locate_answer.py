@@ -8,8 +8,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.locate_request import Technique
+from app.api.models import AppliedView
 from app.positioning.explanation import ExplainedPlace, Explanation
 from app.positioning.fix import Fix
+from app.services.calibrations import AppliedCalibration
 from app.viewer.likelihood import likelihood_png
 
 __all__ = ["BatchAnswer", "FixView", "Timing", "show_fix"]
@@ -133,6 +135,7 @@ class FixView(BaseModel):
     estimates: dict[Technique, Estimate]
     posterior: PosteriorView | None
     map_ids: list[str]
+    calibration: Annotated[AppliedView | None, Field(description="that was applied to the window; null: none")] = None
     timing_ms: Timing
     explanation: Annotated[ExplanationView | None, Field(description="only with explain=true")] = None
 
@@ -147,6 +150,7 @@ def show_fix(
     map_ids: list[str],
     timing: Timing,
     explanation: Explanation | None = None,
+    calibration: AppliedCalibration | None = None,
 ) -> FixView:
     """The fix as the contract shows it, with the techniques that were asked for."""
     nothing = Estimate(available=False, reason=fix.reason or "no candidate floor has a map")
@@ -169,6 +173,7 @@ def show_fix(
         estimates={technique: estimates[technique] for technique in techniques},
         posterior=posterior,
         map_ids=map_ids,
+        calibration=None if calibration is None else AppliedView(**calibration.told),
         timing_ms=timing,
         explanation=None if explanation is None else _explained(explanation),
     )

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Discriminator, Field, Tag, model_validator
 
-from app.api.models import Finite, Point, RequestModel
+from app.api.models import Finite, Name, Point, RequestModel
+from app.calibration.sensor_model import SensorModel
 from app.errors import Fault, InvalidWindow
 from app.geometry import Array, rotate_by_quaternion
 from app.positioning.fix import LocateOptions
 from app.positioning.window import Window
 from app.survey.units import field_faults
 
-__all__ = ["MAX_BATCH", "BatchBody", "LocateBody", "Technique", "core_options", "core_window"]
+__all__ = ["MAX_BATCH", "BatchBody", "LocateBody", "OrientationFrame", "Technique", "core_options", "core_window"]
 
 MAX_BATCH = 100
 MAX_SAMPLES = 20_000  # of the description; the setting max_window_samples refuses sooner
@@ -26,6 +27,7 @@ Quaternion = Annotated[list[Annotated[Finite, Field(ge=-2, le=2)]], Field(min_le
 Radians = Annotated[float, Field(allow_inf_nan=False, ge=-100.0, le=100.0)]
 FloorId = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]
 
+OrientationFrame = Literal["building", "level"]
 Technique = Literal["ml", "mlr", "abl", "mad", "contour"]
 STEP_SCALE_SD = 0.05
 SPEED_SD = 0.2  # of a window indexed by time: nobody keeps a pace
@@ -53,7 +55,8 @@ class WindowBody(RequestModel):
     frame: Annotated[
         Literal["building", "level", "body", "norm"],
         Field(description="building: b and displacement in the building frame; level: both in the level frame of the "
-              "first sample, yaw unknown unless heading_rad is given; body: b in the sensor's axes with orientation; "
+              "first sample, yaw unknown unless heading_rad is given; body: b in the sensor's axes with orientation, "
+              "displacement in the frame that the orientation turns to; "
               "norm: b_ut is a flat list of |B|, displacement in the level frame"),
     ]  # fmt: skip
     b_ut: Annotated[
@@ -71,8 +74,19 @@ class WindowBody(RequestModel):
         Finite | None, Field(ge=0, le=100, description="of a window indexed by time: it went straight ahead, this fast")
     ] = None
     orientation: Annotated[
-        list[Quaternion] | None, Field(max_length=MAX_SAMPLES, description="body to building, [w, x, y, z]")
+        list[Quaternion] | None, Field(max_length=MAX_SAMPLES, description="of frame body, [w, x, y, z]")
     ] = None
+    orientation_frame: Annotated[
+        OrientationFrame,
+        Field(
+            description="what orientation turns the sensor's axes to: building; level: the level frame of the first "
+            "sample, whose yaw is unknown unless heading_rad is given (of a phone: its roll, pitch and gyroscope)"
+        ),
+    ] = "building"
+    calibration_id: Annotated[
+        FloorId | None, Field(description="of frame body: the device's calibration, applied to b_ut")
+    ] = None
+    device: Annotated[Name | None, Field(description="the same by name: its newest calibration")] = None
     heading_rad: Annotated[Radians | None, Field(description="yaw of the first sample's level frame")] = None
     heading_sd_rad: Annotated[Finite, Field(ge=1e-4, le=10)] | None = None
     yaw_rad: Annotated[
@@ -101,6 +115,12 @@ class WindowBody(RequestModel):
             raise ValueError("a window indexed by time has no direction in the building: use frame level or norm")
         if self.frame == "body" and self.orientation is None:
             raise ValueError("the body frame needs orientation: [[w, x, y, z], ...], body to building")
+        if self.frame != "body" and (self.calibration_id is not None or self.device is not None):
+            raise ValueError(
+                "a calibration is of the sensor's own axes: send frame body, b_ut uncorrected, orientation"
+            )
+        if self.frame != "body" and self.orientation_frame != "building":
+            raise ValueError("orientation_frame is of frame body")
         return self
 
 
@@ -186,9 +206,11 @@ class BatchBody(RequestModel):
     queries: Annotated[list[LocateBody], Field(min_length=1, max_length=MAX_BATCH)]
 
 
-def core_window(body: WindowBody) -> Window:
-    """The window in one of the core's frames: a body window is turned to the building frame here."""
+def core_window(body: WindowBody, calibration: SensorModel | None = None) -> Window:
+    """The window in one of the core's frames: a body window is calibrated, and turned to one of them, here."""
     B = np.asarray(body.b_ut, dtype=np.float64).reshape(len(body.b_ut), -1)
+    if calibration is not None:
+        B = calibration.apply(B)
     frame = body.frame
     norm_uT = B[:, 0] if frame == "norm" else np.linalg.norm(B, axis=1)
     message, faults = field_faults(norm_uT, lambda sample: f"/body/window/b_ut/{sample}")
@@ -212,7 +234,7 @@ def core_window(body: WindowBody) -> Window:
         q = q / norms[:, None]
         axes = np.repeat(np.eye(3)[None], len(q), axis=0)
         device_to_frame = np.stack([rotate_by_quaternion(q, axes[:, k]) for k in range(3)], axis=2)
-        B, frame = rotate_by_quaternion(q, B), "building"
+        B, frame = rotate_by_quaternion(q, B), body.orientation_frame
     return Window(
         frame=frame,
         B_uT=B,

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-__all__ = ["Finite", "Id", "Metres", "Name", "Point", "RequestModel", "unchanged"]
+__all__ = ["AppliedView", "Finite", "Id", "Metres", "Name", "Point", "RequestModel", "unchanged"]
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
@@ -18,6 +18,14 @@ class RequestModel(BaseModel):
     """A request body: unknown names are refused, so that a misspelt option is never silently ignored."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+class AppliedView(BaseModel):
+    """The calibration that was applied to readings."""
+
+    id: str
+    device: str
+    version: int
 
 
 def unchanged() -> Any:

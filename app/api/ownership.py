@@ -5,12 +5,12 @@ from typing import TypeVar
 from sqlalchemy.orm import Session
 
 from app.api.auth import Identity
-from app.db.tables import Building, Floor, Job, Map, Survey, Track
+from app.db.tables import Building, Calibration, Floor, Job, Map, Survey, Track
 from app.errors import NotFound
 
 __all__ = ["find_own"]
 
-Owned = TypeVar("Owned", Building, Floor, Survey, Map, Job, Track)
+Owned = TypeVar("Owned", Building, Calibration, Floor, Survey, Map, Job, Track)
 
 
 def find_own(session: Session, identity: Identity, kind: type[Owned], row_id: str) -> Owned:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 
 from app.api.auth import Identity, Locating
 from app.api.body import read_upload
+from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
 from app.api.models import Finite, Id
 from app.api.ownership import find_own
@@ -19,6 +20,7 @@ from app.api.problems import ERROR_RESPONSES
 from app.api.surveys import SURVEY_FILES, SurveyFormat
 from app.db.tables import Floor
 from app.errors import Conflict
+from app.services.calibrations import AppliedCalibration, find_calibration
 from app.services.locate_window import ActiveMap, active_maps
 from app.services.receive_survey import read_on_floor
 from app.services.replay_walk import Replay, ReplayedFix, replay_walk
@@ -72,14 +74,18 @@ async def replay(
     ] = "building",
     window_m: Annotated[Finite, Query(ge=1, le=200, description="length of a window, walked")] = 10.0,
     every_m: Annotated[Finite, Query(ge=0.2, le=200, description="from one window to the next")] = 2.0,
+    calibration_id: CalibrationId = None,
+    device: DeviceQuery = None,
 ) -> StreamingResponse:
     """The walk is read as a survey would be and never stored. Windows are asked without a prior, on this floor, and
     take their turn with those of others; a client that goes away ends the work."""
-    elevation_m, maps = await run_in_threadpool(_floor_and_maps, context, identity, floor_id)
+    elevation_m, maps, calibration = await run_in_threadpool(
+        _floor_and_maps, context, identity, floor_id, calibration_id, device
+    )
     data = await read_upload(request, context.settings.max_upload_bytes)
 
     def begin() -> Replay:
-        walk = read_on_floor(data, format=format, frame=frame, elevation_m=elevation_m)
+        walk = read_on_floor(data, format=format, frame=frame, elevation_m=elevation_m, calibration=calibration)
         floors = context.grids.searchable([(each.floor_id, each.grid_sha256) for each in maps])
         return replay_walk(walk, floors, window_m, every_m)
 
@@ -87,14 +93,17 @@ async def replay(
     return StreamingResponse(_lines(context, floor_id, begun), media_type="application/x-ndjson")
 
 
-def _floor_and_maps(context: Context, identity: Identity, floor_id: str) -> tuple[float, list[ActiveMap]]:
-    """The floor's elevation and its active map. Raises NotFound, Conflict."""
+def _floor_and_maps(
+    context: Context, identity: Identity, floor_id: str, calibration_id: str | None, device: str | None
+) -> tuple[float, list[ActiveMap], AppliedCalibration | None]:
+    """The floor's elevation and its active map, and the device's calibration. Raises NotFound, Conflict."""
     with context.transaction() as session:
         elevation_m = find_own(session, identity, Floor, floor_id).elevation_m
         maps = active_maps(session.connection(), identity.organisation_id, floor_ids=[floor_id])
+        calibration = find_calibration(session, identity.organisation_id, calibration_id, device)
     if not maps:
         raise Conflict(f"floor {floor_id} has no map yet; upload surveys and wait for its job")
-    return elevation_m, maps
+    return elevation_m, maps, calibration
 
 
 async def _lines(context: Context, floor_id: str, begun: Replay) -> AsyncIterator[str]:

@@ -1,7 +1,8 @@
 """Surveys: upload a walk, see what was read, how it fits the others, leave it out, delete it."""
 
 import json
-from datetime import datetime
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
@@ -12,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, SurveyReading, SurveyWriting
 from app.api.body import read_upload
+from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
@@ -19,11 +21,13 @@ from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Id, Name, RequestModel
 from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
-from app.db.tables import Floor, Job, Map, Survey
+from app.db.tables import Building, Floor, Job, Map, Survey
 from app.errors import NotFound
 from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency, WalkLocalizability
+from app.geodesy import Anchor
 from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
+from app.services.calibrations import AppliedCalibration, find_calibration
 from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
 
 __all__ = ["SURVEY_FILES", "SurveyFormat", "SurveyView", "router"]
@@ -67,6 +71,12 @@ class SurveyView(BaseModel):
     sha256: Annotated[str, Field(description="of the uploaded bytes")]
     created_at: datetime
     session: Annotated[str | None, Field(description="the sensor's calibration session, where it is known")] = None
+    calibration_id: Annotated[
+        str | None, Field(description="the device's calibration that was applied to its readings; null: none")
+    ] = None
+    excluded_s: Annotated[
+        list[list[float]], Field(description="stretches of its time that no map is built from, [[start, end], ...]")
+    ] = []
     replaces: Annotated[str | None, Field(description="the survey whose place it took")] = None
 
 
@@ -95,7 +105,8 @@ class SurveySamples(BaseModel):
 
 
 def show_survey(row: Survey) -> SurveyView:
-    names = ("id", "floor_id", "name", "format", "frame", "sample_count", "included", "created_at")
+    names = ("id", "floor_id", "name", "format", "frame", "sample_count", "included", "created_at", "calibration_id",
+             "excluded_s")  # fmt: skip
     told = {name: row.report.get(name) for name in ("session", "replaces")} | {"sha256": row.raw_sha256}
     return SurveyView.model_validate(told | {name: getattr(row, name) for name in names})
 
@@ -134,6 +145,8 @@ async def upload_survey(
             examples=["robot-7 2026-03-02"],
         ),
     ] = None,
+    calibration_id: CalibrationId = None,
+    device: DeviceQuery = None,
     replaces: Annotated[
         str | None,
         Query(
@@ -150,14 +163,19 @@ async def upload_survey(
 
     The answer 200 gives the survey that is there already, as it is: one left out of maps stays so, and has no job.
     With `replaces` the old survey is deleted and the new one recorded in one step, and mapped by one job.
+
+    With `calibration_id`, or `device` for that device's newest, readings in the sensor's axes (a table with
+    quaternions, a trace) are calibrated before anything else; the survey and its report say by which. Where the
+    building has an anchor, the walk is checked against the Earth's field there: `reference_field` and `warnings` of the
+    report.
     """
-    elevation_m = await run_in_threadpool(_elevation_m, context, identity, floor_id, replaces)
+    told = await run_in_threadpool(_told_of, context, identity, floor_id, replaces, calibration_id, device)
     data = await read_upload(request, context.settings.max_upload_bytes)
 
     def receive() -> Response:
         parsed = parse_survey(
-            context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=elevation_m,
-            session=session,
+            context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
+            session=session, calibration=told.calibration, anchor=told.anchor, today=datetime.now(UTC).date(),
         )  # fmt: skip
 
         def create(transaction: Session) -> tuple[int, BaseModel]:
@@ -171,13 +189,30 @@ async def upload_survey(
     return await run_in_threadpool(receive)
 
 
-def _elevation_m(context: Context, identity: Identity, floor_id: str, replaces: str | None) -> float:
-    """Of the floor; raises NotFound and InvalidInput before anything is stored."""
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What is known of a survey before it is read."""
+
+    elevation_m: float
+    anchor: Anchor | None
+    calibration: AppliedCalibration | None
+
+
+def _told_of(
+    context: Context, identity: Identity, floor_id: str, replaces: str | None, calibration_id: str | None,
+    device: str | None,
+) -> _Told:  # fmt: skip
+    """Raises NotFound and InvalidInput before anything is stored."""
     with context.transaction() as session:
         floor = find_own(session, identity, Floor, floor_id)
         if replaces is not None and not was_replaced(session, floor, replaces):
             find_replaced(session, floor, replaces)
-        return floor.elevation_m
+        anchor = session.scalars(select(Building.anchor).where(Building.id == floor.building_id)).one()
+        return _Told(
+            floor.elevation_m,
+            None if anchor is None else Anchor(**anchor),
+            find_calibration(session, identity.organisation_id, calibration_id, device),
+        )
 
 
 @router.get("/floors/{floor_id}/surveys", summary="List a floor's surveys")

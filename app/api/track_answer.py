@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from app.api.locate_request import OrientationFrame
+from app.api.models import AppliedView
 from app.api.track_request import Frame
 from app.db.tables import Track
 from app.services.follow import Outcome
@@ -77,6 +79,8 @@ class TrackView(BaseModel):
     map_ids: Annotated[list[str], Field(description="the maps it is followed on, whatever is built later")]
     options: Annotated[dict[str, Any], Field(description="of the filter, all with their values")]
     prior: dict[str, Any] | None
+    orientation_frame: Annotated[OrientationFrame, Field(description="of frame body")]
+    calibration: Annotated[AppliedView | None, Field(description="applied to every step; null: none")]
     next_step: Annotated[int, Field(description="the number waited for; all before it are stored, or were given up")]
     waiting: Annotated[int, Field(description="steps that came before one that is missing")]
     idle_timeout_s: float
@@ -155,13 +159,19 @@ def show_track(row: Track, idle: bool, idle_timeout_s: float) -> TrackView:
         frame=row.frame, seed=row.seed, floor_ids=[each[0] for each in row.spec["maps"]],  # type: ignore[arg-type]
         map_ids=[each[1] for each in row.spec["maps"]],
         options={name.replace("_uT", "_ut"): value for name, value in row.spec["options"].items()},
-        prior=row.spec["prior"], next_step=row.next_step, waiting=len(row.waiting), idle_timeout_s=idle_timeout_s,
+        prior=row.spec["prior"], orientation_frame=row.spec.get("orientation_frame", "building"),
+        calibration=_calibration(row), next_step=row.next_step, waiting=len(row.waiting), idle_timeout_s=idle_timeout_s,
         created_at=row.created_at, last_step_at=row.touched_at, ended_at=row.ended_at,
         links={
             "self": path, "steps": f"{path}/steps", "stream": f"{path}/stream", "path": f"{path}/path",
             "replay": f"{path}/replay",
         },
     )  # fmt: skip
+
+
+def _calibration(row: Track) -> AppliedView | None:
+    told = row.spec.get("calibration")
+    return None if told is None else AppliedView(**{name: told[name] for name in ("id", "device", "version")})
 
 
 def steps_answer(outcome: Outcome) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
-from app.api.locate_request import FloorId, Microtesla, PriorBody, Quaternion, Radians, Vector
+from app.api.locate_request import FloorId, Microtesla, OrientationFrame, PriorBody, Quaternion, Radians, Vector
 from app.api.models import Finite, Name, RequestModel
 from app.errors import Fault, InvalidInput
 from app.services.step_order import RawStep
@@ -50,7 +50,9 @@ class StepBody(RequestModel):
         Annotated[float, Field(allow_inf_nan=False, ge=-1e4, le=1e4)] | None,
         Field(description="of the device since the first step; null: it turns with its path"),
     ] = None
-    orientation: Annotated[Quaternion | None, Field(description="of frame body: body to building, [w, x, y, z]")] = None
+    orientation: Annotated[
+        Quaternion | None, Field(description="of frame body: the sensor's axes to orientation_frame, [w, x, y, z]")
+    ] = None
     heading_rad: Annotated[Radians | None, Field(description="yaw of the track's frame in the building, if known")] = (
         None
     )
@@ -152,8 +154,20 @@ class NewTrack(RequestModel):
         Frame,
         Field(description="building: b and displacement in the building frame; level: both in the level frame of the "
               "first step, yaw unknown unless heading_rad is given; body: b in the sensor's axes with orientation, "
-              "displacement in the building frame; norm: b_ut is |B|, displacement in the level frame"),
+              "displacement in the frame that the orientation turns to; norm: b_ut is |B|, displacement in the level "
+              "frame"),
     ]  # fmt: skip
+    orientation_frame: Annotated[
+        OrientationFrame,
+        Field(description="of frame body, what orientation turns the sensor's axes to: building; level: the level "
+              "frame of the first step (of a phone: its roll, pitch and gyroscope)"),
+    ] = "building"  # fmt: skip
+    calibration_id: Annotated[
+        FloorId | None, Field(description="of frame body: the device's calibration, applied to b_ut of every step")
+    ] = None
+    device: Annotated[
+        Name | None, Field(description="the same by name: its newest calibration, for the whole track")
+    ] = None
     options: Annotated[TrackOptionsBody, Field(default_factory=lambda: TrackOptionsBody.model_validate({}))]
     prior: Annotated[PriorBody | None, Field(description="where the first step is; null: anywhere")] = None
     seed: Annotated[int | None, Field(ge=0, le=MOST_NUMBER, description="of all that is drawn; default: a new one")] = (
@@ -165,6 +179,10 @@ class NewTrack(RequestModel):
     def _somewhere(self) -> Self:
         if self.building_id is None and self.floor_ids is None:
             raise ValueError("say where: building_id, or floor_ids")
+        if self.frame != "body" and (self.calibration_id is not None or self.device is not None):
+            raise ValueError("a calibration is of the sensor's own axes: use frame body, b_ut uncorrected, orientation")
+        if self.frame != "body" and self.orientation_frame != "building":
+            raise ValueError("orientation_frame is of frame body")
         return self
 
 
@@ -202,7 +220,9 @@ def _shape_faults(step: StepBody, frame: str, index: int) -> list[Fault]:
             Fault(f"{where}/b_ut", f"in frame {frame} b_ut is {'|B|' if frame == 'norm' else '[bx, by, bz]'}")
         )
     if frame == "body" and step.b_ut is not None and step.orientation is None:
-        faults.append(Fault(f"{where}/orientation", "frame body needs it: [w, x, y, z], body to building"))
+        faults.append(
+            Fault(f"{where}/orientation", "frame body needs it: [w, x, y, z], the sensor's axes to orientation_frame")
+        )
     if step.orientation is not None and frame != "body":
         faults.append(Fault(f"{where}/orientation", f"of frame body only; this track is in frame {frame}"))
     if step.orientation is not None and abs(float(np.linalg.norm(step.orientation)) - 1.0) > 0.1:

@@ -39,6 +39,7 @@ from app.api.track_ground import read_ground
 from app.api.track_request import NewTrack, StepsBody, core_options, core_prior, raw_steps
 from app.db.tables import Building, Floor, Track, TrackSteps
 from app.errors import Conflict, Fault, InvalidInput, TooMany
+from app.services.calibrations import find_calibration
 from app.services.locate_window import ActiveMap, active_maps
 from app.services.replay_track import ReplayedBatch, replay_track
 from app.services.step_order import RawStep
@@ -65,10 +66,12 @@ def create_track(
         _check_count(session, context, identity)
         floors, maps = _floors_and_maps(session, identity, body)
         ground = read_ground(body.options, {each.floor_id: floors[each.floor_id].outline for each in maps})
+        calibration = find_calibration(session, identity.organisation_id, body.calibration_id, body.device)
         row = Track(
             organisation_id=identity.organisation_id, key_id=identity.key_id, name=body.name, frame=body.frame,
             building_id=next(iter(floors.values())).building_id, seed=randbits(53) if body.seed is None else body.seed,
-            spec=make_spec(maps, core_options(body.options), core_prior(body.prior), ground),
+            spec=make_spec(maps, core_options(body.options), core_prior(body.prior), ground,
+                           body.orientation_frame, calibration),
         )  # fmt: skip
         check_walkable(context.follower.trackers.make(row.spec, row.frame, row.seed))
         session.add(row)

@@ -1,4 +1,4 @@
-"""The tables: organisation, key, building, floor, survey, map, job, track; and worker and idempotency beside them.
+"""The tables: organisation, key, building, floor, calibration, survey, map, job, track; and worker and idempotency.
 
 Ids are UUIDv7 strings, so they sort by creation. Times are UTC. Every row that a key may reach carries its
 organisation. `migrations/` holds the same schema as history; a test compares the two.
@@ -27,6 +27,7 @@ __all__ = [
     "BUILD",
     "Base",
     "Building",
+    "Calibration",
     "Floor",
     "Idempotency",
     "Job",
@@ -136,7 +137,34 @@ class Floor(Base):
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
+class Calibration(Base):
+    """A device's calibration, which never changes: a later one is another row, of the next `version`.
+
+    `model` is what is applied, `fit` all that is known of it, `reference` what it was measured against (as JSON);
+    `samples_sha256` the readings it was made from, in the blob store."""
+
+    __tablename__ = "calibration"
+    __table_args__ = (
+        UniqueConstraint("organisation_id", "device", "version"),
+        Index("ix_calibration_organisation_id_id", "organisation_id", "id"),
+    )
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    device: Mapped[str] = mapped_column(String(200))
+    version: Mapped[int]
+    method: Mapped[str] = mapped_column(String(40))
+    model: Mapped[dict[str, Any]]
+    fit: Mapped[dict[str, Any]]
+    reference: Mapped[dict[str, Any]]
+    samples_sha256: Mapped[str] = mapped_column(Sha256)
+    measured_at: Mapped[datetime]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
 class Survey(Base):
+    """`calibration_id`: that of the device which walked it, applied to its samples as they came in. `excluded_s`:
+    stretches of its time that no map is built from, [[start, end], ...]."""
+
     __tablename__ = "survey"
     __table_args__ = (UniqueConstraint("floor_id", "raw_sha256", "format", "frame"),)
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
@@ -150,6 +178,8 @@ class Survey(Base):
     sample_count: Mapped[int]
     report: Mapped[dict[str, Any]]
     included: Mapped[bool] = mapped_column(default=True)
+    calibration_id: Mapped[str | None] = mapped_column(ForeignKey("calibration.id"))
+    excluded_s: Mapped[list[list[float]]] = mapped_column(JSON, default=list, server_default="[]")
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 

@@ -5,7 +5,6 @@ import numpy as np
 from app.field.grid import FieldGrid
 from app.positioning.locate import prepare_floor
 from app.services.step_order import RawStep
-from app.services.track_spec import CORE_FRAME
 from app.services.track_steps import core_step
 from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.track import begin, follow, make_tracker
@@ -21,7 +20,7 @@ def warm_up_tracks() -> None:
         np.ones(cells.shape[:3], dtype=bool), np.full(3, 20.0), np.ones(3), np.ones(3),
     )  # fmt: skip
     floor = prepare_floor("warm-up", grid)
-    tracker = make_tracker([floor], CORE_FRAME["level"], TrackOptions(), 0, StartPrior((5.0, 5.0, 0.0), 1.0))
+    tracker = make_tracker([floor], "level", TrackOptions(), 0, StartPrior((5.0, 5.0, 0.0), 1.0))
     state = begin()
     for number in range(2):
         raw: RawStep = {"number": number, "t_s": 0.0, "b_ut": [20.0] * 3, "displacement_m": [float(number), 0.0, 0.0]}

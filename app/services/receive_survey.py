@@ -5,6 +5,8 @@ worst a blob nobody names.
 """
 
 from dataclasses import dataclass, replace
+from datetime import date
+from math import degrees
 
 import numpy as np
 from sqlalchemy import and_, or_, select
@@ -12,10 +14,14 @@ from sqlalchemy.orm import Session
 
 from app.blobs import BlobStore
 from app.db.tables import Floor, Job, Survey
+from app.earth_field import earth_field, field_in_building_uT
 from app.errors import Conflict, Fault, InvalidInput, NotFound
 from app.field.samples import SampleFrame
+from app.geodesy import Anchor
 from app.jobs.queue import JobQueue, lock_floor
 from app.services.artefacts import samples_to_bytes
+from app.services.calibrations import AppliedCalibration
+from app.survey.earth_check import check_against_earth
 from app.survey.read import read_survey
 from app.survey.walk import Walk
 
@@ -37,6 +43,7 @@ class ParsedSurvey:
     report: dict[str, object]
     session: str | None
     elevation_m: float
+    calibration_id: str | None = None
 
 
 def parse_survey(
@@ -48,10 +55,22 @@ def parse_survey(
     name: str,
     elevation_m: float,
     session: str | None = None,
+    calibration: AppliedCalibration | None = None,
+    anchor: Anchor | None = None,
+    today: date,
 ) -> ParsedSurvey:
-    """Read a survey file and store its bytes and its samples. Raises UnreadableSurvey; then nothing is stored."""
-    walk = read_on_floor(data, format=format, frame=frame, session=session, elevation_m=elevation_m)
+    """Read a survey file and store its bytes and its samples. Raises UnreadableSurvey; then nothing is stored.
+
+    The device's `calibration` is applied to its readings; surveys of one calibration share a session, unless it is
+    told. With an `anchor` the walk is checked against the Earth's field there, `today`.
+    """
+    if calibration is not None and session is None:
+        session = calibration.label
+    walk = read_on_floor(
+        data, format=format, frame=frame, session=session, elevation_m=elevation_m, calibration=calibration
+    )
     samples = walk.samples
+    report = walk.report | _told_calibration(calibration) | _earth_check(walk, anchor, today)
     return ParsedSurvey(
         format=format,
         frame=samples.frame,
@@ -59,18 +78,56 @@ def parse_survey(
         raw_sha256=blobs.put(data),
         samples_sha256=blobs.put(samples_to_bytes(samples)),
         sample_count=len(samples),
-        report=walk.report,
+        report=report,
         session=session,
         elevation_m=elevation_m,
+        calibration_id=None if calibration is None else calibration.id,
     )
 
 
+def _told_calibration(calibration: AppliedCalibration | None) -> dict[str, object]:
+    return {"calibration": None if calibration is None else calibration.told}
+
+
+def _earth_check(walk: Walk, anchor: Anchor | None, today: date) -> dict[str, object]:
+    """How the walk compares with the Earth's field, and its findings among the warnings."""
+    if anchor is None:
+        return {"reference_field": None}
+    field = earth_field(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m, today)
+    check = check_against_earth(walk.samples, field_in_building_uT(field, anchor), bearing_known=True)
+    warnings = walk.report["warnings"]
+    assert isinstance(warnings, list)
+    if not field.valid:
+        warnings.append(f"{field.model} ended on {field.valid_until}: the Earth's field is carried on from it")
+    return {
+        "warnings": [*warnings, *check.findings],
+        "reference_field": {
+            "model": field.model,
+            "date": today.isoformat(),
+            "magnitude_ut": round(check.earth_magnitude_uT, 3),
+            "inclination_deg": round(degrees(check.earth_inclination_rad), 2),
+            "measured_magnitude_ut": round(check.magnitude_uT, 3),
+            "measured_inclination_deg": (
+                None if check.inclination_rad is None else round(degrees(check.inclination_rad), 2)
+            ),
+            "findings": list(check.findings),
+        },
+    }
+
+
 def read_on_floor(
-    data: bytes, *, format: str, frame: SampleFrame, elevation_m: float, session: str | None = None
+    data: bytes,
+    *,
+    format: str,
+    frame: SampleFrame,
+    elevation_m: float,
+    session: str | None = None,
+    calibration: AppliedCalibration | None = None,
 ) -> Walk:
     """The walk in a survey file, in building metres on a floor whose slab is at `elevation_m`. Raises UnreadableSurvey,
     TooLarge."""
-    walk = read_survey(data, format=format, frame=frame, session=session)
+    correct = None if calibration is None else calibration.model.apply
+    walk = read_survey(data, format=format, frame=frame, session=session, correct=correct)
     if format not in DEVICE_HEIGHT_FORMATS:
         return walk
     lifted_m = walk.samples.p_building_m + np.array([0.0, 0.0, elevation_m])
@@ -137,6 +194,9 @@ def _same_survey(session: Session, floor_id: str, parsed: ParsedSurvey, replaces
 
 def _check_session(same: Survey, parsed: ParsedSurvey) -> None:
     said, now = same.report.get("session"), parsed.session
+    if same.calibration_id != parsed.calibration_id:
+        before = f"calibration {same.calibration_id}" if same.calibration_id else "no calibration"
+        raise Conflict(f"these bytes are survey {same.id} already, with {before}; give replaces={same.id}")
     if now not in (None, said):
         raise Conflict(f"these bytes are survey {same.id} already, of session {said}; give replaces={same.id}")
 
@@ -152,6 +212,7 @@ def _new_survey(floor: Floor, parsed: ParsedSurvey, replaces: str | None) -> Sur
         samples_sha256=parsed.samples_sha256,
         sample_count=parsed.sample_count,
         report=parsed.report | {"replaces": replaces},
+        calibration_id=parsed.calibration_id,
     )
 
 

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.calibration.sensor_model import SensorModel
 from app.errors import Fault, InvalidInput
 from app.geometry import Array
 from app.positioning.window import WindowFrame
+from app.services.calibrations import AppliedCalibration, model_as_json, stored_model
 from app.services.grid_cache import GridCache
 from app.services.locate_window import ActiveMap
 from app.tracking.ground import Connector, Ground, barriers_of
@@ -24,20 +26,30 @@ from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.track import make_tracker
 from app.tracking.track_state import Tracker
 
-__all__ = ["CORE_FRAME", "TrackSpec", "Trackers", "check_walkable", "make_spec"]
-
-CORE_FRAME: dict[str, WindowFrame] = {"building": "building", "body": "building", "level": "level", "norm": "norm"}
-"""The core's frame of each frame of the contract: a body step is turned to the building frame as it comes in."""
+__all__ = ["TrackSpec", "Trackers", "check_walkable", "core_frame", "make_spec", "spec_model"]
 
 TrackSpec = dict[str, Any]
 """`maps` [[floor id, map id, hash of the grid]], `options` by name, `prior`, and `ground`: `walkable` polygons and
-`walls` by floor id, `connectors`; all coordinates building metres."""
+`walls` by floor id, `connectors`; all coordinates building metres; `orientation_frame` and `calibration` of frame
+body."""
 
 _MOST_TRACKERS = 32
 
 
+def core_frame(spec: TrackSpec, frame: str) -> WindowFrame:
+    """The core's frame of a frame of the contract: a body step is turned to another as it comes in."""
+    if frame == "body":
+        return spec.get("orientation_frame", "building")  # type: ignore[no-any-return]
+    return frame  # type: ignore[return-value]
+
+
 def make_spec(
-    maps: Sequence[ActiveMap], options: TrackOptions, prior: StartPrior | None, ground: Mapping[str, Any]
+    maps: Sequence[ActiveMap],
+    options: TrackOptions,
+    prior: StartPrior | None,
+    ground: Mapping[str, Any],
+    orientation_frame: str,
+    calibration: AppliedCalibration | None,
 ) -> TrackSpec:
     """Everything that is pinned, as JSON."""
     told = {name: value for name, value in asdict(replace(options, ground=None)).items() if name != "ground"}
@@ -46,7 +58,15 @@ def make_spec(
         "options": told,
         "prior": None if prior is None else {"position_m": list(prior.position_m), "sd_m": prior.sd_m},
         "ground": dict(ground),
+        "orientation_frame": orientation_frame,
+        "calibration": None if calibration is None else calibration.told | model_as_json(calibration.model),
     }
+
+
+def spec_model(spec: TrackSpec) -> SensorModel | None:
+    """What the readings of a track are calibrated by."""
+    told = spec.get("calibration")
+    return None if told is None else stored_model(told)
 
 
 class Trackers:
@@ -59,7 +79,9 @@ class Trackers:
 
     def make(self, spec: TrackSpec, frame: str, seed: int) -> Tracker:
         """Raises IncompatibleFrames; NotFound and CorruptArtefact for a grid that is gone."""
-        shared = self._of_maps(tuple((floor_id, sha256) for floor_id, _, sha256 in spec["maps"]), CORE_FRAME[frame])
+        shared = self._of_maps(
+            tuple((floor_id, sha256) for floor_id, _, sha256 in spec["maps"]), core_frame(spec, frame)
+        )
         known = {field.name for field in fields(TrackOptions)}
         told = {name: value for name, value in spec["options"].items() if name in known}
         ground, prior = _ground(spec["ground"]), spec["prior"]

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from app.calibration.sensor_model import SensorModel
 from app.geometry import rotate_by_quaternion
 from app.services.step_order import RawStep
 from app.tracking.step import Step
@@ -9,10 +10,12 @@ from app.tracking.step import Step
 __all__ = ["core_step"]
 
 
-def core_step(raw: RawStep, frame: str) -> Step:
-    """A body step is turned to the building frame here; its orientation is one already of nearly unit length."""
+def core_step(raw: RawStep, frame: str, calibration: SensorModel | None = None) -> Step:
+    """A body step is calibrated, and turned to the core's frame, here; its orientation is one of nearly unit length."""
     told = raw.get("b_ut")
     B = None if told is None else np.atleast_1d(np.asarray(told, dtype=np.float64))
+    if B is not None and calibration is not None:
+        B = calibration.apply(B)
     device_to_frame = None
     if frame == "body" and raw.get("orientation") is not None:
         q = np.asarray(raw["orientation"], dtype=np.float64)

@@ -99,8 +99,10 @@ def numbers_of(column: Any) -> Array:
     return np.array(np.from_dlpack(whole.combine_chunks()))
 
 
-def samples_from_columns(columns: Columns, frame: SampleFrame) -> tuple[Samples, list[str]]:
-    """Checked samples, and what was assumed to get them, as sentences.
+def samples_from_columns(
+    columns: Columns, frame: SampleFrame, correct: Callable[[Array], Array] | None = None
+) -> tuple[Samples, list[str]]:
+    """Checked samples, and what was assumed to get them, as sentences. `correct` is a calibration of the sensor.
 
     Raises UnreadableSurvey with every kind of fault found, at most `MAX_FAULTS` in all.
     """
@@ -114,7 +116,7 @@ def samples_from_columns(columns: Columns, frame: SampleFrame) -> tuple[Samples,
     _refuse(_not_finite(columns), "the survey holds values that are not finite numbers; remove those samples")
     _refuse(_not_in_order(columns), "time has to increase from each sample to the next; sort and deduplicate the rows")
     _refuse(_not_in_a_building(columns), "the survey leaves the building; give metres in the building frame")
-    B_uT, q, assumptions = _field(columns, frame)
+    B_uT, q, assumptions = _field(columns, frame, correct)
     kept: SampleFrame = "building" if q is not None else frame
     return Samples(columns.values["t_s"], columns.stack(POSITION), B_uT, kept, q), assumptions
 
@@ -164,10 +166,17 @@ def _not_in_a_building(columns: Columns) -> list[Fault]:
     return columns.faults(jump, None, lambda i: f"a jump of {step_m[i - 1]:,.0f} m from the sample before")
 
 
-def _field(columns: Columns, frame: SampleFrame) -> tuple[Array, Array | None, list[str]]:
+def _field(
+    columns: Columns, frame: SampleFrame, correct: Callable[[Array], Array] | None
+) -> tuple[Array, Array | None, list[str]]:
     """The field in the frame of the samples, the attitude if the file knew it, and what was assumed."""
     names = tuple(name for name in columns.values if name.endswith("_ut"))
     b = columns.stack(names)
+    if correct is not None:
+        if "qw" not in columns.values:
+            reason = "a calibration is of the sensor's own axes: give b in them, with qw,qx,qy,qz"
+            raise UnreadableSurvey(f"the calibration cannot be applied: {reason}", Fault("calibration", reason))
+        b = correct(b)
     norm_uT = np.linalg.norm(b, axis=1)
     message, faults = field_faults(norm_uT, columns.location)
     if message:
@@ -175,6 +184,8 @@ def _field(columns: Columns, frame: SampleFrame) -> tuple[Array, Array | None, l
     if "qw" in columns.values:
         q, renormalised = _unit_quaternions(columns)
         assumed = ["b is in the body frame and was rotated to the building frame by qw,qx,qy,qz"]
+        if correct is not None:
+            assumed.append("b was corrected by the device's calibration first")
         if frame != "building":
             assumed.append(f"frame={frame} was ignored, because the file has quaternions")
         if renormalised:

@@ -4,6 +4,7 @@ Up from the phone, yaw from the gyroscope with one offset per walk, positions fr
 the field from the raw magnetometer less the phone's own bias. What was assumed is in the walk's report.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,11 +44,16 @@ class _Magnetometer:
     bias_changes: int
 
 
-def read_indoor_location(data: bytes) -> Walk:
-    """Read one trace. Raises UnreadableSurvey with line and reason, TooLarge."""
+def read_indoor_location(
+    data: bytes, session: str | None = None, correct: Callable[[Array], Array] | None = None
+) -> Walk:
+    """Read one trace. Raises UnreadableSurvey with line and reason, TooLarge.
+
+    `correct` is a calibration of the phone's raw channel, in place of the phone's own bias, and `session` its label.
+    """
     trace = parse_trace(data)
     waypoints = _waypoints(trace)
-    magnetometer = _magnetometer(trace)
+    magnetometer = _magnetometer(trace, session, correct)
     kept = _between_waypoints(magnetometer.t_s, waypoints)
     t_s = magnetometer.t_s[kept]
     start_s = t_s[0]
@@ -81,6 +87,7 @@ def read_indoor_location(data: bytes) -> Walk:
             session=magnetometer.session,
             bias_uT=magnetometer.bias_uT,
             bias_changes=magnetometer.bias_changes,
+            corrected=correct is not None,
         ),
     }
     warnings = report["warnings"]
@@ -109,8 +116,8 @@ def _waypoints(trace: Trace) -> Stream:
     return waypoints
 
 
-def _magnetometer(trace: Trace) -> _Magnetometer:
-    """The raw field less the phone's bias where the trace has both, else the phone's calibrated field."""
+def _magnetometer(trace: Trace, session: str | None, correct: Callable[[Array], Array] | None) -> _Magnetometer:
+    """The raw field as calibrated, or less the phone's own bias where the trace has both, else the phone's field."""
     raw, calibrated = trace.streams.get("MAGNETIC_FIELD_UNCALIBRATED"), trace.streams.get("MAGNETIC_FIELD")
     stream = raw or calibrated
     if stream is None or len(stream) < FEWEST_SAMPLES:
@@ -120,7 +127,9 @@ def _magnetometer(trace: Trace) -> _Magnetometer:
             Fault("TYPE_MAGNETIC_FIELD", f"{found} records"),
         )
     check_sample_count(len(stream))
-    if raw is None:
+    if correct is not None:
+        magnetometer = _Magnetometer(stream.t_s, correct(stream.values[:, :3]), session, None, 0)
+    elif raw is None:
         magnetometer = _Magnetometer(stream.t_s, stream.values, None, None, 0)
     else:
         triples, counts = np.unique(raw.values[:, 3:], axis=0, return_counts=True)

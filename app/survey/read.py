@@ -6,6 +6,7 @@ from typing import get_args
 
 from app.errors import Fault, UnreadableSurvey
 from app.field.samples import SampleFrame
+from app.geometry import Array
 from app.survey.columns import Columns, samples_from_columns
 from app.survey.csv_table import read_csv
 from app.survey.indoor_location import read_indoor_location
@@ -24,12 +25,25 @@ _TABLES: dict[str, Callable[[bytes, SampleFrame], Columns]] = {
 FORMATS = (*_TABLES, "indoor-location-2020")
 
 
-def read_survey(data: bytes, *, format: str, frame: SampleFrame = "building", session: str | None = None) -> Walk:
+Correct = Callable[[Array], Array]
+"""Readings (n, 3) in the sensor's axes, uT, to the field: a device's calibration."""
+
+
+def read_survey(
+    data: bytes,
+    *,
+    format: str,
+    frame: SampleFrame = "building",
+    session: str | None = None,
+    correct: Correct | None = None,
+) -> Walk:
     """Read one walk from the (decompressed) bytes of a survey file.
 
     format    one of `FORMATS`
     frame     what b is in a table without quaternions: "building", "level" or "norm"; traces find their own
     session   label of the sensor's calibration session (Samples.session): tables with quaternions; traces have theirs
+    correct   the device's calibration: for files that have the readings in the sensor's own axes, tables with
+              quaternions and traces (there it replaces the phone's own bias)
 
     Raises UnreadableSurvey with line, column and reason for anything that cannot be used, TooLarge beyond the most
     samples a survey may have (2,000,000). Nothing else.
@@ -43,9 +57,10 @@ def read_survey(data: bytes, *, format: str, frame: SampleFrame = "building", se
             f"unknown frame {frame[:40]!r}; known are {', '.join(get_args(SampleFrame))}", Fault("frame", "unknown")
         )
     if format == "indoor-location-2020":
-        _refuse_session(session, "a trace says its calibration session itself, by the phone's own bias")
-        return read_indoor_location(data)
-    samples, assumptions = samples_from_columns(_TABLES[format](data, frame), frame)
+        if correct is None:
+            _refuse_session(session, "a trace says its calibration session itself, by the phone's own bias")
+        return read_indoor_location(data, session, correct)
+    samples, assumptions = samples_from_columns(_TABLES[format](data, frame), frame, correct)
     if samples.q_body_to_building is None:
         _refuse_session(session, "a sensor's offset is known in its own frame only: give qw,qx,qy,qz and b in it")
     samples = replace(samples, session=session)

@@ -27,13 +27,14 @@ def trace_report(
     session: str | None,
     bias_uT: Array | None,
     bias_changes: int,
+    corrected: bool,
 ) -> dict[str, object]:
     """Sections `device`, `assumptions`, `warnings` and `quality` of the report."""
     return {
         "device": trace.header,
         "session": session,
-        "assumptions": _assumptions(motion, offset, thinned, device_height_m, bias_uT),
-        "warnings": [*trace.warnings, *_warnings(motion, legs, offset, waypoints, bias_uT, bias_changes)],
+        "assumptions": _assumptions(motion, offset, thinned, device_height_m, bias_uT, corrected),
+        "warnings": [*trace.warnings, *_warnings(motion, legs, offset, waypoints, session, bias_changes)],
         "quality": {
             **_path_quality(motion, legs),
             **_yaw_quality(motion, legs, offset),
@@ -48,7 +49,9 @@ def trace_report(
     }
 
 
-def _assumptions(motion: Motion, offset: YawOffset, thinned: int, height_m: float, bias_uT: Array | None) -> list[str]:
+def _assumptions(
+    motion: Motion, offset: YawOffset, thinned: int, height_m: float, bias_uT: Array | None, corrected: bool
+) -> list[str]:
     found = [
         "the floor plan's x points East and y North (any turn of the plan is left in the yaw offset)",
         f"the device was carried {height_m:g} m above the floor",
@@ -58,7 +61,9 @@ def _assumptions(motion: Motion, offset: YawOffset, thinned: int, height_m: floa
         f"of the range of its acceleration",
         "waypoints are right to 0.5 m (1 sd)",
     ]
-    if bias_uT is None:
+    if corrected:
+        found.append("the field is the phone's raw channel, corrected by the device's calibration")
+    elif bias_uT is None:
         found.append("the calibrated magnetometer channel is used; its bias may jump when the phone recalibrates")
     else:
         found.append("the field is the uncalibrated channel less the phone's own bias, one bias for the whole walk")
@@ -70,7 +75,7 @@ def _assumptions(motion: Motion, offset: YawOffset, thinned: int, height_m: floa
 
 
 def _warnings(
-    motion: Motion, legs: Legs, offset: YawOffset, waypoints: Stream, bias_uT: Array | None, bias_changes: int
+    motion: Motion, legs: Legs, offset: YawOffset, waypoints: Stream, session: str | None, bias_changes: int
 ) -> list[str]:
     found = []
     if not len(motion.steps):
@@ -84,7 +89,7 @@ def _warnings(
             "the walking direction disagrees with the phone's compass; the phone was probably not held along the way, "
             "and the compass was believed"
         )
-    if bias_uT is None:
+    if session is None:
         found.append("no TYPE_MAGNETIC_FIELD_UNCALIBRATED: the calibration session is unknown")
     if bias_changes:
         found.append(f"the phone changed its bias {bias_changes} times; the one used longest was subtracted throughout")

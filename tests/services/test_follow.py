@@ -22,7 +22,7 @@ from app.services.locate_window import ActiveMap
 from app.services.manage_keys import ensure_admin_key
 from app.services.replay_track import replay_track
 from app.services.track_log import batches_of, delete_track
-from app.services.track_spec import CORE_FRAME, Trackers, check_walkable, make_spec
+from app.services.track_spec import Trackers, check_walkable, core_frame, make_spec
 from app.services.track_steps import core_step
 from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.track import begin, follow, make_tracker
@@ -64,7 +64,9 @@ class World:
         with self.sessions() as session:
             made = session.scalars(select(Map).where(Map.floor_id == self.floor_id)).one()
         assert made.grid_sha256 is not None
-        return make_spec([ActiveMap(self.floor_id, made.id, made.grid_sha256)], OPTIONS, prior, ground or {})
+        return make_spec(
+            [ActiveMap(self.floor_id, made.id, made.grid_sha256)], OPTIONS, prior, ground or {}, "building", None
+        )
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +106,7 @@ def test_a_track_is_that_of_the_pure_tracker_and_replays_bit_for_bit(
 ) -> None:
     steps, track = hall_steps(frame, 160), world.new_track(frame)
     outcomes = send(world.follower(), track, steps)
-    tracker = make_tracker([prepare_floor(world.floor_id, hall_grid)], CORE_FRAME[frame], OPTIONS, 7)
+    tracker = make_tracker([prepare_floor(world.floor_id, hall_grid)], core_frame({}, frame), OPTIONS, 7)
     state = begin()
     for raw in steps:
         followed = follow(tracker, state, core_step(raw, frame))

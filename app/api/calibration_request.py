@@ -1,0 +1,135 @@
+"""What a client sends to have a device calibrated; and how a calibration is named wherever readings come in."""
+
+from datetime import UTC, datetime
+from datetime import date as Date
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from fastapi import Query
+from pydantic import AwareDatetime, ConfigDict, Field, StringConstraints, model_validator
+
+from app.api.locate_request import FloorId, Quaternion, Vector
+from app.api.models import Finite, Name, Point, RequestModel
+from app.services.calibrate import CIRCLE_METHODS, Asked, MappedWalk, Place
+
+__all__ = ["CalibrationId", "DeviceQuery", "NewCalibration"]
+
+MOST_READINGS = 50_000
+Method = Literal["two_step", "ellipsoid", "modified_ellipsoid", "strict_ellipse", "swinging", "map_aided"]
+
+CalibrationId = Annotated[
+    str | None,
+    Query(
+        max_length=64,
+        pattern=r"^[A-Za-z0-9_-]+$",
+        description="a calibration of the device, applied to its readings",
+        examples=["0197c1a2-0b7e-7c3d-9a52-5f0e8d6b4c21"],
+    ),
+]
+DeviceQuery = Annotated[
+    Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")] | None,
+    Query(description="the same by name: its newest calibration", examples=["robot-7"]),
+]
+
+
+class ReferenceBody(RequestModel):
+    """The Earth's field where the readings were taken: as it is, or by place and date (the World Magnetic Model)."""
+
+    magnitude_ut: Annotated[Finite | None, Field(gt=5, lt=150)] = None
+    horizontal_ut: Annotated[Finite | None, Field(gt=0.5, lt=150)] = None
+    vertical_ut: Annotated[
+        Finite | None, Field(ge=-150, le=150, description="along the sensor's +z while it is turned level")
+    ] = None
+    latitude_deg: Annotated[Finite | None, Field(ge=-90, le=90)] = None
+    longitude_deg: Annotated[Finite | None, Field(ge=-180, le=180)] = None
+    height_m: Annotated[Finite, Field(ge=-1000, le=10_000, description="above the WGS 84 ellipsoid")] = 0.0
+    building_id: Annotated[FloorId | None, Field(description="instead of a place: outside of this building")] = None
+    date: Annotated[Date | None, Field(description="default: that of measured_at")] = None
+    z_axis: Annotated[
+        Literal["up", "down"], Field(description="where the sensor's z points while it is turned level")
+    ] = "up"
+
+
+class WalkBody(RequestModel):
+    """A walk through a mapped building, for method map_aided: a row for each reading."""
+
+    floor_id: FloorId
+    orientation: Annotated[
+        list[Quaternion], Field(max_length=MOST_READINGS, description="body to building, [w, x, y, z]")
+    ]
+    position_m: Annotated[list[Point], Field(max_length=MOST_READINGS, description="in the building frame")]
+    position_sd_m: Annotated[Finite, Field(ge=0, le=20)] = 0.3
+
+
+class NewCalibration(RequestModel):
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "device": "robot-7",
+                    "method": "two_step",
+                    "reference": {"latitude_deg": 48.1403, "longitude_deg": 11.5583, "height_m": 570.0},
+                    "b_ut": [[21.9, -3.1, -41.8], [24.5, 9.8, -38.0], [-19.2, 4.0, 42.7]],
+                }
+            ]
+        },
+    )
+    device: Annotated[Name, Field(description="a name for it; its calibrations are counted")]
+    method: Annotated[
+        Method,
+        Field(description="two_step, ellipsoid: turned through all directions. modified_ellipsoid, strict_ellipse, "
+              "swinging: turned level, in circles. map_aided: walked through a mapped building"),
+    ] = "two_step"  # fmt: skip
+    b_ut: Annotated[
+        list[Vector],
+        Field(min_length=2, max_length=MOST_READINGS, description="readings in the sensor's own axes, uncalibrated"),
+    ]
+    reference: ReferenceBody | None = None
+    walk: WalkBody | None = None
+    measured_at: Annotated[AwareDatetime | None, Field(description="default: now")] = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.method == "map_aided":
+            if self.walk is None:
+                raise ValueError("map_aided needs walk: where the device was, and how it was held")
+            if not len(self.walk.orientation) == len(self.walk.position_m) == len(self.b_ut):
+                raise ValueError("walk has as many orientations and positions as there are readings in b_ut")
+            return self
+        if self.walk is not None:
+            raise ValueError("walk is for method map_aided")
+        told = self.reference
+        if told is None:
+            raise ValueError("say by reference what the Earth's field was: its magnitude, or the place")
+        placed = told.building_id is not None or (told.latitude_deg is not None and told.longitude_deg is not None)
+        if self.method in CIRCLE_METHODS:
+            if not placed and (told.horizontal_ut is None or told.vertical_ut is None):
+                raise ValueError(f"{self.method} needs reference: horizontal_ut and vertical_ut, or the place")
+        elif not placed and told.magnitude_ut is None:
+            raise ValueError(f"{self.method} needs reference: magnitude_ut, or the place")
+        return self
+
+    def asked(self) -> Asked:
+        """The same for the service."""
+        told = self.reference
+        place = walk = None
+        if told is not None and (told.building_id is not None or told.latitude_deg is not None):
+            on = told.date or (self.measured_at or datetime.now(UTC)).date()
+            place = Place(told.building_id, told.latitude_deg, told.longitude_deg, told.height_m, on, told.z_axis)
+        if self.walk is not None:
+            walk = MappedWalk(
+                self.walk.floor_id,
+                np.asarray(self.walk.orientation, dtype=np.float64),
+                np.asarray(self.walk.position_m, dtype=np.float64),
+                self.walk.position_sd_m,
+            )
+        return Asked(
+            method=self.method,
+            B_uT=np.asarray(self.b_ut, dtype=np.float64),
+            magnitude_uT=None if told is None else told.magnitude_ut,
+            horizontal_uT=None if told is None else told.horizontal_ut,
+            vertical_uT=None if told is None else told.vertical_ut,
+            place=place,
+            walk=walk,
+        )

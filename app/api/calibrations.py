@@ -1,0 +1,111 @@
+"""Calibrations of a device's magnetometer: make one, list them, compare them. A calibration never changes."""
+
+from datetime import UTC, datetime
+from functools import partial
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.api.auth import Calibrating, Measuring
+from app.api.calibration_request import NewCalibration
+from app.api.context import ContextDep
+from app.api.idempotency import IdempotencyKey, RawBody, answer_once
+from app.api.listing import Page, PagingDep, list_page
+from app.api.models import Id, Name
+from app.api.ownership import find_own
+from app.api.problems import ERROR_RESPONSES
+from app.db.tables import Calibration
+from app.services.calibrate import calibrate
+from app.services.calibrations import record_calibration
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["calibration"], responses=ERROR_RESPONSES)
+
+
+class ModelView(BaseModel):
+    """`B = correction (b - hard_iron)` for a reading b, all in the sensor's own axes."""
+
+    hard_iron_ut: list[float]
+    correction: list[list[float]]
+
+
+class CoverageView(BaseModel):
+    """Which directions of the field were seen, in the sensor's axes."""
+
+    kind: str
+    cells_seen: int
+    cells: int
+    unseen_axes: Annotated[list[str], Field(description="`+z`: no direction within 45 degrees of it was seen")]
+    condition: float
+
+
+class CalibrationView(BaseModel):
+    id: str
+    device: str
+    version: Annotated[int, Field(description="counts the device's calibrations from 1")]
+    method: str
+    model: ModelView
+    parameters: Annotated[dict[str, float], Field(description="the method's own, by name")]
+    parameter_sd: Annotated[dict[str, float], Field(description="absent: the readings say nothing of it")]
+    covariance: Annotated[list[list[float]], Field(description="of the parameters, in their order")]
+    residual_rms_ut: float
+    residual_max_ut: float
+    samples: int
+    outliers: int
+    coverage: CoverageView
+    determined: list[str]
+    undetermined: list[str]
+    advice: Annotated[list[str], Field(description="what would make it better")]
+    reference: Annotated[dict[str, Any], Field(description="what it was measured against")]
+    measured_at: datetime
+    created_at: datetime
+
+
+def show_calibration(row: Calibration) -> CalibrationView:
+    names = ("id", "device", "version", "method", "model", "reference", "measured_at", "created_at")
+    return CalibrationView.model_validate({name: getattr(row, name) for name in names} | row.fit)
+
+
+@router.post("/calibrations", status_code=201, response_model=CalibrationView, summary="Calibrate a device")
+async def create_calibration(
+    body: NewCalibration, raw: RawBody, request: Request, context: ContextDep, identity: Calibrating,
+    key: IdempotencyKey = None,
+) -> Response:  # fmt: skip
+    """From readings taken while the device was turned, against the Earth's field (given, or by place and date), or from
+    a walk through a mapped building. It becomes the device's newest version; those before stay as they are, and so do
+    surveys they were applied to. Refused with advice where the readings do not determine it."""
+
+    def create(session: Session) -> tuple[int, BaseModel]:
+        fit, reference, readings = calibrate(session, context.grids, identity.organisation_id, body.asked())
+        row = record_calibration(
+            session, context.blobs, identity.organisation_id, device=body.device, fit=fit, reference=reference,
+            readings=readings, measured_at=body.measured_at or datetime.now(UTC),
+        )  # fmt: skip
+        return 201, show_calibration(row)
+
+    return await run_in_threadpool(partial(answer_once, context, identity, request, key, raw, create))
+
+
+@router.get("/calibrations", summary="List calibrations")
+def list_calibrations(
+    context: ContextDep,
+    identity: Measuring,
+    paging: PagingDep,
+    device: Annotated[Name | None, Query(description="of this device only")] = None,
+) -> Page[CalibrationView]:
+    own = select(Calibration).where(Calibration.organisation_id == identity.organisation_id)
+    if device is not None:
+        own = own.where(Calibration.device == device)
+    with context.transaction() as session:
+        return list_page(session, own, Calibration.id, paging, show_calibration)
+
+
+@router.get("/calibrations/{calibration_id}", summary="One calibration")
+def get_calibration(calibration_id: Id, context: ContextDep, identity: Measuring) -> CalibrationView:
+    with context.transaction() as session:
+        return show_calibration(find_own(session, identity, Calibration, calibration_id))

@@ -1,0 +1,150 @@
+"""Calibrate a device: what it was turned or walked in, the method, and the result with what it was measured against."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import date
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from sqlalchemy.orm import Session
+
+from app.calibration.ellipsoid import ellipsoid
+from app.calibration.fit import CalibrationFit
+from app.calibration.map_aided import map_aided
+from app.calibration.modified_ellipsoid import modified_ellipsoid
+from app.calibration.strict_ellipse import strict_ellipse
+from app.calibration.swinging import swinging
+from app.calibration.two_step import two_step
+from app.db.tables import Building
+from app.earth_field import EarthField, earth_field
+from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
+from app.geometry import Array
+from app.services.grid_cache import GridCache
+from app.services.locate_window import active_maps
+
+__all__ = ["CIRCLE_METHODS", "Asked", "MappedWalk", "Place", "calibrate"]
+
+CIRCLE_METHODS = ("modified_ellipsoid", "strict_ellipse", "swinging")
+"""Those for a device that is turned level; the others need it turned through all directions."""
+
+_CIRCLES = {"modified_ellipsoid": modified_ellipsoid, "strict_ellipse": strict_ellipse, "swinging": swinging}
+_SPHERES = {"ellipsoid": ellipsoid, "two_step": two_step}
+LEAST_MAPPED = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where readings were taken outdoors: a building's anchor, or a latitude and longitude."""
+
+    building_id: str | None
+    latitude_deg: float | None
+    longitude_deg: float | None
+    height_m: float
+    on: date
+    z_axis: Literal["up", "down"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedWalk:
+    """Attitudes (n, 4), body to building, and positions (n, 3) in the building of a walk on a mapped floor."""
+
+    floor_id: str
+    q_body_to_building: Array
+    p_building_m: Array
+    position_sd_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """A calibration that is asked for: readings (n, 3) in the sensor's axes, and what they are measured against."""
+
+    method: str
+    B_uT: Array
+    magnitude_uT: float | None
+    horizontal_uT: float | None
+    vertical_uT: float | None
+    place: Place | None
+    walk: MappedWalk | None
+
+
+def calibrate(
+    session: Session, grids: GridCache, organisation_id: str, asked: Asked
+) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
+    """The fit, the reference as JSON, and the arrays it was made from.
+
+    Raises InvalidInput with advice where the readings do not determine it, NotFound, Conflict (no map yet).
+    """
+    if asked.walk is not None:
+        return _on_a_map(session, grids, organisation_id, asked, asked.walk)
+    earth = None if asked.place is None else _earth(session, organisation_id, asked.place)
+    readings = {"b_ut": asked.B_uT}
+    told: dict[str, Any] = {} if earth is None else {"model": earth.model, "date": earth.on.isoformat()}
+    if asked.method in CIRCLE_METHODS:
+        horizontal, vertical = asked.horizontal_uT, asked.vertical_uT
+        if earth is not None:
+            assert asked.place is not None
+            horizontal = horizontal or earth.horizontal_uT
+            down = earth.down_uT if asked.place.z_axis == "down" else -earth.down_uT
+            vertical = down if vertical is None else vertical
+        assert horizontal is not None
+        assert vertical is not None
+        fit = _CIRCLES[asked.method](asked.B_uT, horizontal, vertical)
+        return fit, told | {"horizontal_ut": horizontal, "vertical_ut": vertical}, readings
+    magnitude = asked.magnitude_uT
+    if earth is not None:
+        magnitude = magnitude or earth.magnitude_uT
+    assert magnitude is not None
+    return _SPHERES[asked.method](asked.B_uT, magnitude), told | {"magnitude_ut": magnitude}, readings
+
+
+def _earth(session: Session, organisation_id: str, place: Place) -> EarthField:
+    if place.building_id is None:
+        assert place.latitude_deg is not None
+        assert place.longitude_deg is not None
+        return earth_field(place.latitude_deg, place.longitude_deg, place.height_m, place.on)
+    building = session.get(Building, place.building_id)
+    if building is None or building.organisation_id != organisation_id:
+        raise NotFound(f"no building {place.building_id}")
+    if building.anchor is None:
+        reason = f"building {building.id} has no anchor: PATCH its latitude, longitude, height and bearing first"
+        raise InvalidInput(reason, Fault("/body/reference/building_id", reason))
+    anchor = building.anchor
+    return earth_field(anchor["latitude_deg"], anchor["longitude_deg"], anchor["height_m"], place.on)
+
+
+def _on_a_map(
+    session: Session, grids: GridCache, organisation_id: str, asked: Asked, walk: MappedWalk
+) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
+    maps = active_maps(session.connection(), organisation_id, floor_ids=[walk.floor_id])
+    if not maps:
+        raise Conflict(f"floor {walk.floor_id} has no map yet; upload surveys and wait for its job")
+    grid = grids.grid(maps[0].grid_sha256)
+    if grid.components != "vector":
+        raise IncompatibleFrames(
+            f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
+        )
+    values = grid.at(walk.p_building_m)
+    kept = values.measured
+    if kept.sum() < LEAST_MAPPED:
+        reason = (
+            f"{int(kept.sum())} of {len(kept)} readings were taken where the floor is mapped, {LEAST_MAPPED} are needed"
+        )
+        raise InvalidInput(f"{reason}; walk where surveyors walked", Fault("/body/walk/position_m", reason))
+    slope = values.gradient_uT_per_m[kept][:, :, :2]
+    fit = map_aided(
+        asked.B_uT[kept],
+        Rotation.from_quat(walk.q_body_to_building[kept], scalar_first=True).as_matrix(),
+        values.mean_uT[kept],
+        values.sd_uT[kept] ** 2 + walk.position_sd_m**2 * (slope**2).sum(axis=2),
+        path_m=_path_m(walk.p_building_m[kept]),
+    )
+    readings = {
+        "b_ut": asked.B_uT, "orientation": walk.q_body_to_building, "position_m": walk.p_building_m,
+    }  # fmt: skip
+    reference = {"floor_id": walk.floor_id, "map_id": maps[0].map_id, "position_sd_m": walk.position_sd_m}
+    return fit, reference | {"mapped_readings": int(kept.sum())}, readings
+
+
+def _path_m(p_m: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_m, axis=0), axis=1))])

@@ -1,0 +1,130 @@
+"""A device's calibrations as they are kept: made once, never changed, applied by name."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.blobs import BlobStore
+from app.calibration.fit import CalibrationFit
+from app.calibration.sensor_model import SensorModel
+from app.db.tables import Calibration
+from app.errors import Fault, InvalidInput, NotFound
+from app.geometry import Array
+from app.services.artefacts import pack
+
+__all__ = ["AppliedCalibration", "applied", "find_calibration", "model_as_json", "record_calibration", "stored_model"]
+
+
+@dataclass(frozen=True, slots=True)
+class AppliedCalibration:
+    """A calibration as it is applied to readings, and what is said of it wherever it was."""
+
+    id: str
+    device: str
+    version: int
+    model: SensorModel
+
+    @property
+    def label(self) -> str:
+        """Of what surveys of one calibration share."""
+        return f"{self.device} v{self.version}"
+
+    @property
+    def told(self) -> dict[str, Any]:
+        return {"id": self.id, "device": self.device, "version": self.version}
+
+
+def applied(row: Calibration) -> AppliedCalibration:
+    return AppliedCalibration(row.id, row.device, row.version, stored_model(row.model))
+
+
+def stored_model(model: Mapping[str, Any]) -> SensorModel:
+    """The model in a row's JSON."""
+    return SensorModel(
+        np.asarray(model["hard_iron_ut"], dtype=np.float64), np.asarray(model["correction"], dtype=np.float64)
+    )
+
+
+def model_as_json(model: SensorModel) -> dict[str, Any]:
+    return {"hard_iron_ut": model.hard_iron_uT.tolist(), "correction": model.correction.tolist()}
+
+
+def find_calibration(
+    session: Session, organisation_id: str, calibration_id: str | None, device: str | None
+) -> AppliedCalibration | None:
+    """The calibration of this id, or the device's newest; None when neither is told.
+
+    Raises NotFound, and InvalidInput when an id is of another device.
+    """
+    if calibration_id is None and device is None:
+        return None
+    own = select(Calibration).where(Calibration.organisation_id == organisation_id)
+    if calibration_id is None:
+        of_device = own.where(Calibration.device == device).order_by(Calibration.version.desc()).limit(1)
+        row = session.scalars(of_device).first()
+        if row is None:
+            raise NotFound(f"device {device} has no calibration yet; make one by POST /v1/calibrations")
+        return applied(row)
+    row = session.scalars(own.where(Calibration.id == calibration_id)).first()
+    if row is None:
+        raise NotFound(f"no calibration {calibration_id}")
+    if device not in (None, row.device):
+        reason = f"calibration {calibration_id} is of device {row.device}"
+        raise InvalidInput(reason, Fault("device", reason))
+    return applied(row)
+
+
+def record_calibration(
+    session: Session, blobs: BlobStore, organisation_id: str, *,
+    device: str, fit: CalibrationFit, reference: Mapping[str, Any], readings: Mapping[str, Array],
+    measured_at: datetime,
+) -> Calibration:  # fmt: skip
+    """Keep a calibration as the device's next version. Its readings are on disk before the row that names them."""
+    sha256 = blobs.put(pack({"kind": "calibration"}, dict(readings)))
+    newest = session.scalar(
+        select(func.max(Calibration.version)).where(
+            Calibration.organisation_id == organisation_id, Calibration.device == device
+        )
+    )
+    row = Calibration(
+        organisation_id=organisation_id,
+        device=device,
+        version=(newest or 0) + 1,
+        method=fit.method,
+        model=model_as_json(fit.model),
+        fit=_fit_as_json(fit),
+        reference=dict(reference),
+        samples_sha256=sha256,
+        measured_at=measured_at,
+    )
+    session.add(row)
+    session.flush()  # two at once: the later one breaks the unique version, and is tried again
+    return row
+
+
+def _fit_as_json(fit: CalibrationFit) -> dict[str, Any]:
+    coverage = fit.coverage
+    return {
+        "parameters": dict(fit.parameters),
+        "parameter_sd": dict(fit.parameter_sd),
+        "covariance": fit.covariance.tolist(),
+        "residual_rms_ut": fit.residual_rms_uT,
+        "residual_max_ut": fit.residual_max_uT,
+        "samples": fit.samples,
+        "outliers": fit.outliers,
+        "coverage": {
+            "kind": coverage.kind,
+            "cells_seen": coverage.cells_seen,
+            "cells": coverage.cells,
+            "unseen_axes": list(coverage.unseen_axes),
+            "condition": coverage.condition,
+        },
+        "determined": list(fit.determined),
+        "undetermined": list(fit.undetermined),
+        "advice": list(fit.advice),
+    }
