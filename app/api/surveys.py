@@ -3,11 +3,11 @@
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -18,7 +18,7 @@ from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.jobs import JobView, show_job
 from app.api.listing import Page, PagingDep, list_page
-from app.api.models import Id, Name, RequestModel
+from app.api.models import Finite, Id, Name, RequestModel, unchanged
 from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Building, Floor, Job, Map, Survey
@@ -28,6 +28,7 @@ from app.geodesy import Anchor
 from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
 from app.services.calibrations import AppliedCalibration, find_calibration
+from app.services.disturbances import checked_stretches, union_s
 from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
 
 __all__ = ["SURVEY_FILES", "SurveyFormat", "SurveyView", "router"]
@@ -88,7 +89,22 @@ class ReceivedSurvey(BaseModel):
 
 
 class SurveyPatch(RequestModel):
-    included: Annotated[bool, Field(description="false leaves the survey out of maps built from now on")]
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"included": False}]})
+    included: Annotated[bool, Field(description="false leaves the survey out of maps built from now on")] = unchanged()
+    excluded_s: Annotated[
+        list[Annotated[list[Finite], Field(min_length=2, max_length=2)]],
+        Field(max_length=1000, description="stretches of its time to leave out of maps, [[start, end], ...]; [] takes "
+              "all in again"),
+    ] = unchanged()  # fmt: skip
+    exclude_disturbed: Annotated[
+        Literal[True], Field(description="leave out every stretch that `disturbances` tells, besides those left out")
+    ] = unchanged()
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if not self.model_fields_set:
+            raise ValueError("say what to change: included, excluded_s or exclude_disturbed")
+        return self
 
 
 class PatchedSurvey(SurveyView):
@@ -278,6 +294,56 @@ def get_consistency(
     return ConsistencyView(survey_id=survey_id, map_id=map_id, **report)
 
 
+class DisturbanceView(BaseModel):
+    """A stretch of a survey's time with a disturbed field: something passed by, was switched on, or attached."""
+
+    start_s: float
+    end_s: float
+    kind: Annotated[
+        str, Field(description="map: it departs from the map of the others; all else the walk shows itself")
+    ]
+    reason: str
+    size_ut: float
+    p_value: Annotated[float, Field(description="of anything as clear in an undisturbed walk of its length")]
+
+
+class DisturbancesView(BaseModel):
+    survey_id: str
+    map_id: Annotated[str | None, Field(description="whose other surveys it was compared with; null: there is none")]
+    stretches: list[DisturbanceView]
+    excluded_s: Annotated[list[list[float]], Field(description="what is left out of maps, by PATCH")]
+
+
+def _active_quality(session: Session, survey: Survey) -> tuple[str, str] | None:
+    """Id and quality report of the floor's active map, if it has one."""
+    active = session.scalars(select(Floor.active_map_id).where(Floor.id == survey.floor_id)).one()
+    row = session.get(Map, active) if active else None
+    return None if row is None or row.quality_sha256 is None else (row.id, row.quality_sha256)
+
+
+def _disturbances(context: Context, survey: Survey, quality: tuple[str, str] | None) -> list[DisturbanceView]:
+    told = list(survey.report.get("disturbances") or [])
+    if quality is not None:
+        told += json.loads(context.blobs.get(quality[1])).get("disturbances", {}).get(survey.id, [])
+    return sorted((DisturbanceView(**each) for each in told), key=lambda each: each.start_s)
+
+
+@router.get("/surveys/{survey_id}/disturbances", summary="Where the field was disturbed while it was walked")
+def get_disturbances(survey_id: Id, context: ContextDep, identity: SurveyReading) -> DisturbancesView:
+    """What the walk shows by itself (a step, a hum, a change while standing still, a place that read otherwise before),
+    and where it departs from the floor's active map of the other surveys. Nothing is left out of maps by itself: PATCH
+    the survey with `exclude_disturbed` or with stretches of your own, `excluded_s`."""
+    with context.transaction() as session:
+        survey = find_own(session, identity, Survey, survey_id)
+        quality = _active_quality(session, survey)
+        return DisturbancesView(
+            survey_id=survey_id,
+            map_id=None if quality is None else quality[0],
+            stretches=_disturbances(context, survey, quality),
+            excluded_s=survey.excluded_s,
+        )
+
+
 @router.get("/surveys/{survey_id}/samples", summary="The samples as the map sees them")
 def get_samples(
     survey_id: Id,
@@ -303,7 +369,15 @@ def get_samples(
 def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> PatchedSurvey:
     with context.transaction() as session:
         survey = _lock_survey(session, identity, survey_id)
-        changed, survey.included = survey.included != body.included, body.included
+        before = survey.included, survey.excluded_s
+        if "included" in body.model_fields_set:
+            survey.included = body.included
+        if "excluded_s" in body.model_fields_set:
+            survey.excluded_s = checked_stretches(body.excluded_s, "/body/excluded_s")
+        if "exclude_disturbed" in body.model_fields_set:
+            found = _disturbances(context, survey, _active_quality(session, survey))
+            survey.excluded_s = union_s([*survey.excluded_s, *([each.start_s, each.end_s] for each in found)])
+        changed = before != (survey.included, survey.excluded_s) and (before[0] or survey.included)
         session.flush()
         job = _rebuild(session, context, survey.floor_id) if changed else None
         return PatchedSurvey(**show_survey(survey).model_dump(), job=show_job(job) if job else None)

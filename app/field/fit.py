@@ -105,6 +105,7 @@ def fit_map(
         state=None if spec.refine else estimate.state,
         tiles_refitted=estimate.tiles_refitted,
         continued=estimate.continued,
+        held_out=held_out,
         hard_iron=cleaned.hard_iron.as_json(),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +13,7 @@ from app.field.grid import FieldGrid
 from app.field.samples import Components
 
 if TYPE_CHECKING:
+    from app.field.leave_one_out import HeldOut
     from app.field.tile_fit import FitState
 
 __all__ = [
@@ -216,4 +217,5 @@ class FittedMap:
     state: FitState | None = None  # what the next fit with the same parameters can start from
     tiles_refitted: int = 0
     continued: bool = False  # with what an earlier fit had learned
+    held_out: Mapping[str, HeldOut] = field(default_factory=dict)  # every survey against the map of the others
     hard_iron: dict[str, object] = field(default_factory=dict)  # the offsets taken out, by session and by survey

@@ -22,8 +22,9 @@ from app.field.samples import SampleFrame, Samples, richest_components
 from app.field.spec import FittedMap, MapSpec
 from app.field.tile_fit import FitState
 from app.services.artefacts import grid_to_bytes, layers_to_bytes, samples_from_bytes
+from app.services.disturbances import against_others, without_stretches
 from app.services.exact_limit import TOO_MANY, outgrow_exact
-from app.services.fit_state import state_from_bytes, state_to_bytes
+from app.services.fit_state import Excluded, state_from_bytes, state_to_bytes
 
 __all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "publish_build"]
 
@@ -54,7 +55,9 @@ def claim_build(session: Session, job_id: str) -> Plan:
     job.started_at = job.started_at or now
     job.message = f"fitting {len(map_row.survey_ids)} surveys"
     surveys = session.execute(
-        select(Survey.id, Survey.samples_sha256, Survey.frame).where(Survey.id.in_(map_row.survey_ids))
+        select(Survey.id, Survey.samples_sha256, Survey.frame, Survey.excluded_s).where(
+            Survey.id.in_(map_row.survey_ids)
+        )
     ).all()
     return {
         "map_id": map_row.id,
@@ -63,6 +66,7 @@ def claim_build(session: Session, job_id: str) -> Plan:
         "spec": map_row.spec,
         "rebuild": job.kind == REBUILD,
         "surveys": sorted([row.id, row.samples_sha256, row.frame] for row in surveys),
+        "excluded_s": {row.id: row.excluded_s for row in surveys if row.excluded_s},
         **_earlier_states(session, job, map_row),
     }
 
@@ -100,7 +104,10 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
     if not surveys:
         raise InvalidInput("the floor has no included survey left to build a map from; upload or include one")
     progress(0.0, f"reading {len(surveys)} surveys")
+    excluded: Excluded = plan.get("excluded_s", {})
     walks = {survey_id: samples_from_bytes(blobs.get(sha)) for survey_id, sha, _ in surveys}
+    walks = {name: without_stretches(walk, excluded.get(name, [])) for name, walk in walks.items()}
+    surveys, walks = _with_samples(surveys, walks)
     fallback = _fallback(plan, walks)
     spec = {name: value for name, value in plan["spec"].items() if name != "engine"} if fallback else plan["spec"]
     parameters = dict(spec)
@@ -114,7 +121,7 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
     progress(0.96, "storing the grid")
     for sha256 in plan.get("stale_states", []):
         blobs.discard(sha256)
-    state = state_to_bytes(fitted.state) if fitted.state else None
+    state = state_to_bytes(fitted.state, excluded) if fitted.state else None
     changes = _changes(plan, fitted) | {"fallback": fallback}
     return {
         "state_sha256": blobs.put(state) if state else None,
@@ -122,7 +129,7 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
         "spec": spec,
         "grid_sha256": blobs.put(grid_to_bytes(fitted.grid)),
         "layers_sha256": blobs.put(layers_to_bytes(fitted.layers)) if fitted.layers else None,
-        "quality_sha256": blobs.put(_quality_bytes(fitted, changes)),
+        "quality_sha256": blobs.put(_quality_bytes(fitted, changes, walks)),
         "components": fitted.grid.components,
         "bounds_m": list(fitted.grid.bounds_m),
         "hyperparameters": fitted.hyperparameters,
@@ -138,13 +145,34 @@ def _fallback(plan: Plan, walks: Mapping[str, Samples]) -> str | None:
     return f"{TOO_MANY}: built by engine {MapSpec().engine}, as will be what follows"
 
 
+def _with_samples(
+    surveys: list[tuple[str, str, SampleFrame]], walks: Mapping[str, Samples]
+) -> tuple[list[tuple[str, str, SampleFrame]], dict[str, Samples]]:
+    """Without the surveys of which all, or all but one sample, is excluded. Raises InvalidInput when none is left."""
+    left = {name: walk for name, walk in walks.items() if len(walk) > 1}
+    if not left:
+        raise InvalidInput("every sample of the floor's surveys is excluded; take some stretches in again")
+    return [each for each in surveys if each[0] in left], left
+
+
+def _disturbances(fitted: FittedMap, walks: Mapping[str, Samples]) -> dict[str, Any]:
+    """Of every survey, where it departs from the map of the others."""
+    grid = fitted.grid
+    found = {
+        name: against_others(walks[name], held_out, grid.components, grid.error_structure)
+        for name, held_out in fitted.held_out.items()
+        if held_out.judged.any()
+    }
+    return {name: stretches for name, stretches in found.items() if stretches}
+
+
 def _previous_state(plan: Plan, components: str, blobs: BlobStore) -> FitState | None:
     """The fit to continue, if there is one that can be read."""
     previous = plan.get("previous")
     if not previous or previous["components"] != components:
         return None
     try:
-        return state_from_bytes(blobs.get(previous["state_sha256"]))
+        return state_from_bytes(blobs.get(previous["state_sha256"]), plan.get("excluded_s", {}))
     except (NotFound, CorruptArtefact):
         return None
 
@@ -230,7 +258,7 @@ def _wanted_surveys(session: Session, floor_id: str, map_row: Map) -> list[str]:
     return list(session.scalars(wanted))
 
 
-def _quality_bytes(fitted: FittedMap, changes: Result) -> bytes:
+def _quality_bytes(fitted: FittedMap, changes: Result, walks: Mapping[str, Samples]) -> bytes:
     quality: Mapping[str, Any] = {
         "score": asdict(fitted.score) if fitted.score else None,
         "score_reason": fitted.score_reason,
@@ -240,6 +268,7 @@ def _quality_bytes(fitted: FittedMap, changes: Result) -> bytes:
         "error_correlation_m": fitted.grid.error_correlation_m,
         "error_structure": asdict(fitted.grid.error_structure),
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
+        "disturbances": _disturbances(fitted, walks),
         "changes": changes,
         "hard_iron": fitted.hard_iron,
         "refinement": fitted.hyperparameters.get("refinement"),

@@ -4,7 +4,7 @@ A state is a cache. It is read only by the version of the program that wrote it,
 one from nothing, bit for bit; whatever cannot be read makes the next build a full one.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -21,15 +21,18 @@ from app.field.tile_fit import FitState, HeldOutPart, Learned, TileFit
 from app.field.tiles import Lattice, Slab, Tile
 from app.services.artefacts import pack, unpack
 
-__all__ = ["LARGEST_BYTES", "state_from_bytes", "state_to_bytes"]
+__all__ = ["LARGEST_BYTES", "Excluded", "state_from_bytes", "state_to_bytes"]
 
 LARGEST_BYTES = 400_000_000
 """A larger state is not kept: reading it would cost as much as fitting anew."""
-_VERSION = f"{__version__}-2"
+_VERSION = f"{__version__}-3"
+
+Excluded = Mapping[str, Sequence[Sequence[float]]]
+"""By survey id, the stretches of its time that it was fitted without."""
 
 
-def state_to_bytes(state: FitState) -> bytes | None:
-    """One blob; None when it would be too large to be of use."""
+def state_to_bytes(state: FitState, excluded_s: Excluded) -> bytes | None:
+    """One blob; None when it would be too large to be of use. `excluded_s`: what surveys were fitted without."""
     learned = state.learned
     surveys = sorted({survey_id for fit in state.tiles.values() for survey_id in fit.surveys})
     number = {survey_id: index for index, survey_id in enumerate(surveys)}
@@ -65,6 +68,7 @@ def state_to_bytes(state: FitState) -> bytes | None:
         "surveys": surveys,
         "tiles": tiles,
         "shapes": [single.shapes, double.shapes],
+        "excluded_s": dict(excluded_s),
     }
     arrays = {
         "signal_sd_uT": signal_sd_uT,
@@ -76,11 +80,17 @@ def state_to_bytes(state: FitState) -> bytes | None:
     return pack({"kind": "fit state", **header}, arrays)
 
 
-def state_from_bytes(data: bytes) -> FitState:
-    """The state in a blob. Raises CorruptArtefact, also for one that another version wrote."""
+def state_from_bytes(data: bytes, excluded_s: Excluded) -> FitState:
+    """The state in a blob. Raises CorruptArtefact, also for one that another version wrote, or that was fitted from
+
+    other stretches of a survey than these.
+    """
     header, arrays = unpack(data, "fit state")
     if header.get("written_by") != _VERSION:
         raise CorruptArtefact(f"the fit state was written by version {header.get('written_by')}, this is {_VERSION}")
+    for survey_id in header["surveys"]:
+        if header["excluded_s"].get(survey_id, []) != excluded_s.get(survey_id, []):
+            raise CorruptArtefact(f"the fit state has other stretches of survey {survey_id}")
     single = _arrays(arrays["single"].astype(np.float64), header["shapes"][0])
     double = _arrays(arrays["double"], header["shapes"][1])
     surveys: list[str] = header["surveys"]

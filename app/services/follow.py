@@ -227,8 +227,8 @@ class Follower:
             estimate, last = batch.estimate, batch.steps[-1]
         return Live(
             row.id, row.organisation_id, row.frame, calibration, tracker, state, row.version, row.batches,
-            row.next_step, tuple(row.waiting), tuple((first, stop) for first, stop in row.gaps), last, estimate, kept_step,
-            row.touched_at, row.ended_reason,
+            row.next_step, tuple(row.waiting), tuple((first, stop) for first, stop in row.gaps), last, estimate,
+            kept_step, row.touched_at, row.ended_reason,
         )  # fmt: skip
 
     def _keep(self, live: Live) -> None:

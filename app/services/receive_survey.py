@@ -21,6 +21,7 @@ from app.geodesy import Anchor
 from app.jobs.queue import JobQueue, lock_floor
 from app.services.artefacts import samples_to_bytes
 from app.services.calibrations import AppliedCalibration
+from app.services.disturbances import by_itself
 from app.survey.earth_check import check_against_earth
 from app.survey.read import read_survey
 from app.survey.walk import Walk
@@ -70,7 +71,8 @@ def parse_survey(
         data, format=format, frame=frame, session=session, elevation_m=elevation_m, calibration=calibration
     )
     samples = walk.samples
-    report = walk.report | _told_calibration(calibration) | _earth_check(walk, anchor, today)
+    told = _told_calibration(calibration) | _earth_check(walk, anchor, today)
+    report = walk.report | told | {"disturbances": by_itself(samples)}
     return ParsedSurvey(
         format=format,
         frame=samples.frame,

@@ -33,10 +33,10 @@ WALKS = {f"s{k}": walk(k, 0.4 * k) for k in range(5)}
 def test_a_fit_continues_from_bytes_as_from_memory(spec):
     state = fit_map(WALKS, spec).state
     more = WALKS | {"far": replace(walk(9, 1.0), p_building_m=np.add(walk(9, 1.0).p_building_m, [0.0, 9.0, 0.0]))}
-    data = state_to_bytes(state)
-    assert state_to_bytes(state_from_bytes(data)) == data
+    data = state_to_bytes(state, {})
+    assert state_to_bytes(state_from_bytes(data, {}), {}) == data
     from_bytes, from_memory, anew = (
-        fit_map(more, spec, previous=s) for s in (state_from_bytes(data), state, replace(state, tiles={}))
+        fit_map(more, spec, previous=s) for s in (state_from_bytes(data, {}), state, replace(state, tiles={}))
     )
     assert from_bytes.tiles_refitted == from_memory.tiles_refitted < anew.tiles_refitted
     for name in ("mean_uT", "sd_uT", "gradient_uT_per_m", "noise_sd_uT"):
@@ -46,7 +46,18 @@ def test_a_fit_continues_from_bytes_as_from_memory(spec):
 
 
 def test_the_state_of_another_version_is_not_read(monkeypatch):
-    data = state_to_bytes(fit_map(WALKS, MapSpec(resolution_m=0.5)).state)
+    data = state_to_bytes(fit_map(WALKS, MapSpec(resolution_m=0.5)).state, {})
     monkeypatch.setattr(fit_state, "_VERSION", "another")
     with pytest.raises(CorruptArtefact, match="version"):
-        state_from_bytes(data)
+        state_from_bytes(data, {})
+
+
+def test_a_state_of_other_stretches_is_not_continued() -> None:
+    """A survey's part in the fit is only worth keeping as long as the same samples of it count."""
+    state = fit_map(WALKS, MapSpec(resolution_m=0.5)).state
+    name = min(WALKS)
+    data = state_to_bytes(state, {name: [[1.0, 2.0]]})
+    assert state_from_bytes(data, {name: [[1.0, 2.0]], "newcomer": [[0.0, 1.0]]}).tiles.keys() == state.tiles.keys()
+    for other in ({}, {name: [[1.0, 3.0]]}):
+        with pytest.raises(CorruptArtefact, match=name):
+            state_from_bytes(data, other)
