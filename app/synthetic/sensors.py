@@ -21,6 +21,7 @@ class Magnetometer:
 
     noise_uT                     sd of white noise, per axis
     hard_iron_uT                 constant offset in the body frame
+    distortion                   what turns the true field into the read one before that: scales, soft iron, a rotation
     tilt_sd_rad, yaw_sd_rad      error of the attitude the device believes: roll and pitch, and yaw
     attitude_correlation_s       correlation time of those errors
     position_sd_m                error of a survey's position labels, per axis
@@ -30,6 +31,7 @@ class Magnetometer:
 
     noise_uT: float = 0.4
     hard_iron_uT: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distortion: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     tilt_sd_rad: float = 0.0
     yaw_sd_rad: float = 0.0
     attitude_correlation_s: float = 10.0
@@ -126,7 +128,7 @@ def _measured_body_uT(
     zero = np.zeros_like(half)
     building_to_body = np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
     B = rotate_by_quaternion(building_to_body, building.field_uT(p))
-    return np.asarray(B + sensor.hard_iron_uT + sensor.noise_uT * rng.normal(size=B.shape))
+    return np.asarray(B @ np.array(sensor.distortion).T + sensor.hard_iron_uT + sensor.noise_uT * rng.normal(size=B.shape))
 
 
 def _attitude_error_rad(t_s: Array, sensor: Magnetometer, rng: np.random.Generator) -> Array:

@@ -75,7 +75,8 @@ def _steps(
     tilt = ornstein_uhlenbeck(rng, walk.t_s, sensor.tilt_sd_rad, sensor.attitude_correlation_s, 2)
     half = 0.5 * np.column_stack([tilt, np.zeros(n)])
     q = np.column_stack([np.cos(np.linalg.norm(half, axis=1)), half])
-    B_level = rotate_by_quaternion(q, B_body + sensor.hard_iron_uT + sensor.noise_uT * rng.normal(size=(n, 3)))
+    read = B_body @ np.array(sensor.distortion).T + sensor.hard_iron_uT
+    B_level = rotate_by_quaternion(q, read + sensor.noise_uT * rng.normal(size=(n, 3)))
     B = _turned(yaw_rad, B_level)
     return tuple(Step(k, float(walk.t_s[k]), B[k], moved_m[k], yaw_rad=float(yaw_rad[k])) for k in range(n))
 

@@ -1,0 +1,141 @@
+"""Calibrate a phone by walking through a mapped building, without being told where.
+
+A search that integrates a constant offset of the sensor out finds where a walk of some length went, however magnetised
+the phone; the map along that way then tells what the sensor makes of the field, and with the sensor known the way is
+found better. Two or three rounds settle it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.calibration.fit import CalibrationFit
+from app.calibration.map_aided import map_aided
+from app.errors import Fault, InvalidInput
+from app.field.grid import FieldGrid
+from app.geometry import Array, yaw_matrix
+from app.positioning.explanation import ExplainedPlace
+from app.positioning.fix import Fix, LocateOptions
+from app.positioning.locate import SearchableFloor, locate_and_explain
+from app.positioning.window import Window
+
+__all__ = ["CalibratedOnMap", "Way", "calibrate_along", "calibrate_on_map", "with_sensor", "way_of"]
+
+ROUNDS = 3
+LEFT_UT = 1.0
+"""Sd of the offset a calibrated sensor still has, in the searches after the first."""
+SHAPE_SD_M = 0.3
+"""Sd of where a sample lies on a way that as a whole is right: steps are uneven, and turns err."""
+LEAST_SHARE = 0.5
+"""Of the walk that must be where something is mapped."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """Where each sample of a window was: position_m (n, 2), rotation (n, 3, 3) from the sensor's axes to the
+    building's, covariance_m2 (2, 2) of a position, path_m (n,) walked."""
+
+    position_m: Array
+    rotation: Array
+    covariance_m2: Array
+    path_m: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedOnMap:
+    """The sensor, the walk as it reads when corrected and where it went on which floor, and the fix it ended in."""
+
+    fit: CalibrationFit
+    corrected: Window
+    way: Way
+    floor_id: str
+    fix: Fix
+
+
+def calibrate_on_map(
+    window: Window,
+    floors: Sequence[SearchableFloor],
+    *,
+    hard_iron_sd_uT: float = 30.0,
+    soft_iron_sd: float = 0.1,
+    options: LocateOptions | None = None,
+    rounds: int = ROUNDS,
+) -> CalibratedOnMap:
+    """From a level window over a whole walk, its last 40-100 m best, told how the device was turned at every sample.
+
+    Needs `yaw_rad` (the device then is taken to be level) or `device_to_frame`. The calibration is in the device's
+    axes; it is only good if `fix.status` is "fix". Raises InvalidInput where the walk is mostly off the map.
+    """
+    options = options or LocateOptions()
+    turn = _device_to_frame(window)
+    horizontal_uT = float(np.median([np.hypot(*floor.grid.ambient_uT[:2]) for floor in floors]))
+    distorted_uT = soft_iron_sd * horizontal_uT  # what a distortion makes of the field when the device turns
+    asked = replace(window, noise_uT=float(np.hypot(window.noise_uT, distorted_uT)))
+    bias_sd_uT = hard_iron_sd_uT
+    for _ in range(rounds):
+        fix, explained = locate_and_explain(asked, floors, options=replace(options, bias_sd_uT=bias_sd_uT))
+        if explained is None or fix.posterior is None:
+            raise InvalidInput("There is no map to calibrate on.", Fault("floors", "none has a map"))
+        place = explained.best
+        floor = next(each for each in floors if each.floor_id == place.floor_id)
+        way = way_of(window, turn, place, fix.posterior.covariance_m2)
+        fit = calibrate_along(window, turn, way, floor.grid, hard_iron_sd_uT=hard_iron_sd_uT, soft_iron_sd=soft_iron_sd)
+        asked, bias_sd_uT = with_sensor(window, turn, fit), LEFT_UT
+    return CalibratedOnMap(fit, asked, way, place.floor_id, fix)
+
+
+def calibrate_along(
+    window: Window, device_to_frame: Array, way: Way, grid: FieldGrid, *, hard_iron_sd_uT: float, soft_iron_sd: float
+) -> CalibrationFit:
+    """The calibration of a window whose way is known, with what the map and the way do not know."""
+    field = grid.at(way.position_m)
+    on_map = field.measured
+    if on_map.mean() < LEAST_SHARE:
+        message = f"Only {100 * on_map.mean():.0f} % of the walk is where something is mapped: walk where the map is."
+        raise InvalidInput(message, Fault("window", "mostly off the map"))
+    J = field.gradient_uT_per_m
+    moved_uT2 = np.einsum("nci,ij,ncj->nc", J, way.covariance_m2, J, optimize=True)
+    body = np.einsum("nji,nj->ni", device_to_frame, window.B_uT)
+    return map_aided(
+        body[on_map], way.rotation[on_map], field.mean_uT[on_map], (field.sd_uT**2 + moved_uT2)[on_map],
+        path_m=way.path_m[on_map], noise_uT=window.noise_uT, hard_iron_sd_uT=hard_iron_sd_uT, soft_iron_sd=soft_iron_sd,
+    )  # fmt: skip
+
+
+def way_of(window: Window, device_to_frame: Array, place: ExplainedPlace, covariance_m2: Array) -> Way:
+    """A window's displacements scaled, bent and turned as they fit best, and laid with the last sample where it was."""
+    assert place.heading_rad is not None
+    d = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
+    step = np.diff(d, axis=0)
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step, axis=1))])
+    device_yaw = np.arctan2(device_to_frame[-1, 1, 0], device_to_frame[-1, 0, 0])
+    bend = place.heading_drift_rad_per_m * (path - path[-1])
+    heading = place.heading_rad - device_yaw + bend  # of the window's frame at each sample
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    c, s = np.cos(middle), np.sin(middle)
+    turned = place.step_scale * np.stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]], axis=1)
+    gone = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
+    rotation = np.stack([yaw_matrix(float(a)) for a in heading]) @ device_to_frame
+    return Way(
+        np.array(place.position_m[:2]) + gone - gone[-1], rotation, covariance_m2 + SHAPE_SD_M**2 * np.eye(2), path
+    )
+
+
+def with_sensor(window: Window, device_to_frame: Array, fit: CalibrationFit) -> Window:
+    """The window as a calibrated sensor would have told it."""
+    body = np.einsum("nji,nj->ni", device_to_frame, window.B_uT)
+    return replace(window, B_uT=np.einsum("nij,nj->ni", device_to_frame, fit.model.apply(body)))
+
+
+def _device_to_frame(window: Window) -> Array:
+    """(n, 3, 3). Raises InvalidInput where the window does not tell."""
+    if window.frame != "level":
+        message = "A calibration on a map takes a window of the level frame, with how the device was turned."
+        raise InvalidInput(message, Fault("window/frame", "not level"))
+    if window.device_to_frame is not None:
+        return window.device_to_frame
+    if window.yaw_rad is None:
+        message = "The window does not tell how the device was turned: send yaw_rad, or readings in body axes."
+        raise InvalidInput(message, Fault("window/yaw_rad", "absent"))
+    return np.stack([yaw_matrix(float(a)) for a in window.yaw_rad])
