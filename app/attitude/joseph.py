@@ -3,7 +3,7 @@
 from numba import njit
 from numpy import empty
 
-__all__ = ["condition", "innovation_covariance", "inverse", "squared_distance"]
+__all__ = ["condition", "gain", "innovation_covariance", "inverse", "squared_distance"]
 
 
 @njit(cache=True, nogil=True)
@@ -50,20 +50,25 @@ def squared_distance(S, r):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def condition(P, HP, S, r, dx):  # type: ignore[no-untyped-def]
-    """Update P (n, n) in place by an innovation r (3,) of covariance S (3, 3), noise included; its mean into dx (n,).
-
-    (I - K H) P (I - K H)^T + K R K^T multiplied out: it stays symmetric, and holds for any gain, a rounded one too.
-    """
-    n = P.shape[0]
-    W, K, KS = empty((3, 3)), empty((n, 3)), empty((n, 3))
+def gain(HP, S, K):  # type: ignore[no-untyped-def]
+    """Kalman's gain (n, 3) = P H^T S^-1, noise included in S, into K."""
+    W = empty((3, 3))
     inverse(S, W)
-    for i in range(n):
-        dx[i] = 0.0
+    for i in range(K.shape[0]):
         for a in range(3):
             K[i, a] = HP[0, i] * W[0, a] + HP[1, i] * W[1, a] + HP[2, i] * W[2, a]
-            dx[i] += K[i, a] * r[a]
+
+
+@njit(cache=True, nogil=True)
+def condition(P, HP, S, K, r, dx):  # type: ignore[no-untyped-def]
+    """Update P (n, n) in place by an innovation r (3,) of covariance S (3, 3), noise included; its mean into dx (n,).
+
+    (I - K H) P (I - K H)^T + K R K^T multiplied out: it stays symmetric, and holds for any gain K (n, 3).
+    """
+    n = P.shape[0]
+    KS = empty((n, 3))
     for i in range(n):
+        dx[i] = K[i, 0] * r[0] + K[i, 1] * r[1] + K[i, 2] * r[2]
         for a in range(3):
             KS[i, a] = K[i, 0] * S[0, a] + K[i, 1] * S[1, a] + K[i, 2] * S[2, a]
     for i in range(n):

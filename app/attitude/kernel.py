@@ -16,7 +16,7 @@ from numba import njit
 from numpy import arctan2, cos, empty, exp, isfinite, pi, sin, sqrt, zeros
 
 from app.attitude.error_dynamics import advance, bias_response, building_from_body, process_noise, turn_back
-from app.attitude.joseph import condition, innovation_covariance, squared_distance
+from app.attitude.joseph import condition, gain, innovation_covariance, inverse, squared_distance
 
 __all__ = [
     "ANGLE", "BIAS", "FIELD", "IRON", "KEPT", "LAST_FORCE", "LAST_GYRO", "MEAN_FORCE", "MEAN_GYRO", "MEAN_RESIDUAL",
@@ -28,16 +28,18 @@ ANGLE, BIAS, VELOCITY, FIELD, IRON, SIZE = 0, 3, 6, 9, 12, 15
 
 T, T_GYRO, T_FORCE, T_MAG = 0, 1, 2, 3
 LAST_GYRO, LAST_FORCE, MEAN_GYRO, MEAN_FORCE, MEAN_RESIDUAL = 4, 7, 10, 13, 16
-STILL_S, DISTURBANCE, FORCE_REJECTED_S, MAG_REJECTED_S, NORTH_SET, GRAVITY, KEPT = 19, 20, 21, 22, 23, 24, 25
+STILL_S, DISTURBANCE, FORCE_REJECTED_S, MAG_REJECTED_S, NORTH_SET, GRAVITY = 19, 20, 21, 22, 23, 24
+SUM_WEIGHT, SUM_POWER, SUM_FIELD, SUM_IRON, SUM_R, KEPT = 25, 26, 27, 30, 33, 42
 """What is kept between samples besides mean and covariance: times, last and smoothed readings, how long rejected."""
 
 REST_MEAN_S = 0.5
 RESIDUAL_MEAN_S = 0.3
 REST_CORRELATION_S = 1.0
+NORTH_SET_S = 0.3
 REST_SPEED_M_S = 0.02
 RELEVELLED_RAD = 0.2
-IRON_OPENS_S, FIELD_OPENS_S = 2.0, 20.0
-"""A disturbance is put down to the device within this time, and to the place within that."""
+BLAME_S, BLAME_SPREAD, BLAME_UT, BLAME_SHARE, LEAST_SPREAD, BLAMED_UT = 3.0, 0.2, 3.0, 0.7, 0.02, 1.5
+"""Seconds looked back on, the rotation and scatter needed to judge, the share hard iron must explain of the scatter."""
 UNKNOWN_YAW_RAD2 = pi * pi / 3.0
 
 
@@ -126,13 +128,27 @@ def _predict(q, x, P, k, dt, rate, force, has_force, s):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def _measure(q, x, P, H, r, HP, S, noise):  # type: ignore[no-untyped-def]
-    """Condition on an innovation r (3,), its covariance S (3, 3) so far without this noise (3, 3)."""
+def _measure(q, x, P, H, r, HP, S, noise, upright):  # type: ignore[no-untyped-def]
+    """Condition on an innovation r (3,), its covariance S (3, 3) so far without this noise (3, 3).
+
+    upright: tilt, level gyro biases and velocity are considered, not corrected (Schmidt).
+    """
     total, dx = empty((3, 3)), empty(SIZE)
     for a in range(3):
         for b in range(3):
             total[a, b] = S[a, b] + noise[a, b]
-    condition(P, HP, total, r, dx)
+    R, K = empty((3, 3)), empty((SIZE, 3))
+    gain(HP, total, K)
+    if upright:
+        building_from_body(q, R)
+        for a in range(3):
+            for block in (ANGLE, BIAS):
+                up = R[2, 0] * K[block, a] + R[2, 1] * K[block + 1, a] + R[2, 2] * K[block + 2, a]
+                for i in range(3):
+                    K[block + i, a] = R[2, i] * up
+            for i in range(3):
+                K[VELOCITY + i, a] = 0.0
+    condition(P, HP, total, K, r, dx)
     _apply(q, x, dx)
 
 
@@ -225,7 +241,7 @@ def _at_rest(q, x, P, k, gyro, dt, s):  # type: ignore[no-untyped-def]
     for i in range(3):
         H[i, BIAS + i], noise[i, i], r[i] = 1.0, variance, gyro[i] - x[i]
     innovation_covariance(P, H, HP, S)
-    _measure(q, x, P, H, r, HP, S, noise)
+    _measure(q, x, P, H, r, HP, S, noise, False)
 
 
 @njit(cache=True, nogil=True)
@@ -268,7 +284,7 @@ def _accelerometer(q, x, P, k, f, dt, s):  # type: ignore[no-untyped-def]
         k[FORCE_REJECTED_S] = 0.0
         for i in range(3):
             noise[i, i] = sd * sd * (max(1.0, 2.0 * correlation / dt) - 1.0)
-        _measure(q, x, P, H, r, HP, S, noise)
+        _measure(q, x, P, H, r, HP, S, noise, False)
     else:
         k[FORCE_REJECTED_S] += dt
         if k[FORCE_REJECTED_S] > s.recovery:
@@ -292,8 +308,6 @@ def _disturbance(x, k, R, z, m, S, dt, s):  # type: ignore[no-untyped-def]
         b = 0.0
         for j in range(3):
             b += R[i, j] * (z[j] - x[IRON - BIAS + j])
-        if k[DISTURBANCE] < 0.0:
-            k[MEAN_RESIDUAL + i] = b
         k[MEAN_RESIDUAL + i] = fade * k[MEAN_RESIDUAL + i] + (1.0 - fade) * b
     down = k[MEAN_RESIDUAL + 2] - m[2]
     size = sqrt(k[MEAN_RESIDUAL] ** 2 + k[MEAN_RESIDUAL + 1] ** 2) - level
@@ -304,7 +318,83 @@ def _disturbance(x, k, R, z, m, S, dt, s):  # type: ignore[no-untyped-def]
             expected_size += along[i] * S[i, j] * along[j]
     own = s.field**2
     power = 0.5 * (max(0.0, down**2 - expected_down - own) + max(0.0, size**2 - expected_size - own))
-    k[DISTURBANCE] = max(power, exp(-dt / s.memory) * max(k[DISTURBANCE], 0.0))
+    k[DISTURBANCE] = max(power, exp(-dt / s.memory) * k[DISTURBANCE])
+
+
+@njit(cache=True, nogil=True)
+def _blame_device(x, P, k, R, z, dt, s):  # type: ignore[no-untyped-def]
+    """Learn the hard iron anew where it explains what was read lately.
+
+    Least squares of R z = m + R h over the last seconds, by sums that fade: a magnet on the device turns with it, one in
+    the room does not. Without rotation the two cannot be told apart, and nothing changes.
+    """
+    fade = exp(-dt / BLAME_S)
+    k[SUM_WEIGHT] = fade * k[SUM_WEIGHT] + 1.0
+    power = 0.0
+    for i in range(3):
+        b = R[i, 0] * z[0] + R[i, 1] * z[1] + R[i, 2] * z[2]
+        k[SUM_FIELD + i] = fade * k[SUM_FIELD + i] + b
+        k[SUM_IRON + i] = fade * k[SUM_IRON + i] + z[i]
+        power += z[i] * z[i]
+        for j in range(3):
+            k[SUM_R + 3 * i + j] = fade * k[SUM_R + 3 * i + j] + R[i, j]
+    k[SUM_POWER] = fade * k[SUM_POWER] + power
+    n = k[SUM_WEIGHT]
+    information, right, inverted, iron = empty((3, 3)), empty(3), empty((3, 3)), zeros(3)
+    spread, scatter = 3.0, k[SUM_POWER] / n - 3.0 * s.reading**2
+    for i in range(3):
+        right[i] = k[SUM_IRON + i] / n
+        scatter -= (k[SUM_FIELD + i] / n) ** 2
+        for j in range(3):
+            right[i] -= k[SUM_R + 3 * j + i] / n * k[SUM_FIELD + j] / n
+            information[i, j] = 1.0 + LEAST_SPREAD if i == j else 0.0
+            for a in range(3):
+                information[i, j] -= k[SUM_R + 3 * a + i] / n * k[SUM_R + 3 * a + j] / n
+        spread -= information[i, i] - LEAST_SPREAD
+    spread = 1.0 - spread / 3.0
+    inverse(information, inverted)
+    explained = off = 0.0
+    for i in range(3):
+        for j in range(3):
+            iron[i] += inverted[i, j] * right[j]
+        own = x[IRON - BIAS + i]
+        scatter -= 2.0 * own * right[i]
+        for j in range(3):
+            scatter += own * information[i, j] * x[IRON - BIAS + j]
+    for i in range(3):
+        miss = iron[i] - x[IRON - BIAS + i]
+        off += miss * miss / 3.0
+        for j in range(3):
+            explained += miss * information[i, j] * (iron[j] - x[IRON - BIAS + j])
+    if spread < BLAME_SPREAD or scatter < BLAME_UT**2 or explained < BLAME_SHARE * scatter:
+        return
+    if off > BLAMED_UT**2:
+        _forget(P, IRON)
+        k[DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
+        for i in range(3):
+            x[IRON - BIAS + i], P[IRON + i, IRON + i] = iron[i], BLAMED_UT**2
+
+
+@njit(cache=True, nogil=True)
+def _set_north(q, x, P, k, R, z, m, variance, learned, dt, s):  # type: ignore[no-untyped-def]
+    """Yaw, or the learned field, from the mean of the first readings: their white noise need not be lived with."""
+    mean, weight = empty(3), min(1.0, dt / (k[NORTH_SET] * NORTH_SET_S + dt))
+    k[NORTH_SET] = min(1.0, k[NORTH_SET] + dt / NORTH_SET_S)
+    k[DISTURBANCE] = 0.0
+    for i in range(3):
+        level = R[i, 0] * z[0] + R[i, 1] * z[1] + R[i, 2] * z[2]
+        k[MEAN_RESIDUAL + i] += weight * (level - k[MEAN_RESIDUAL + i])
+    for i in range(3):
+        mean[i] = 0.0
+        for j in range(3):
+            mean[i] += R[j, i] * k[MEAN_RESIDUAL + j]
+    if learned:
+        _learn_field(q, x, P, mean, sqrt(s.reading**2 + s.field**2))
+    elif k[NORTH_SET] == 1.0:
+        typical = (variance[0, 0] + variance[1, 1] + variance[2, 2]) / 3.0
+        _set_yaw(q, x, P, mean, m, s.reading**2 + s.field**2 + typical)
+        for i in range(3):
+            k[MEAN_RESIDUAL + i] = m[i]
 
 
 @njit(cache=True, nogil=True)
@@ -312,18 +402,14 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
     """The field, known or learned; whether it was believed."""
     R, m = empty((3, 3)), empty(3)
     H, HP, S, noise, r = zeros((3, SIZE)), empty((3, SIZE)), empty((3, 3)), zeros((3, 3)), empty(3)
-    if learned and k[NORTH_SET] == 0.0:
-        _learn_field(q, x, P, z, sqrt(s.reading**2 + s.field**2))
-        k[NORTH_SET] = 1.0
-        return True
     for i in range(3):
         m[i] = x[FIELD - BIAS + i] if learned else reference[i]
-    typical = (variance[0, 0] + variance[1, 1] + variance[2, 2]) / 3.0
-    if k[NORTH_SET] == 0.0:
-        _set_yaw(q, x, P, z, m, s.reading**2 + s.field**2 + typical)
-        k[NORTH_SET] = 1.0
-        return True
     building_from_body(q, R)
+    if s.learn_hard_iron:
+        _blame_device(x, P, k, R, z, dt, s)
+    if k[NORTH_SET] < 1.0:
+        _set_north(q, x, P, k, R, z, m, variance, learned, dt, s)
+        return True
     predicted = empty(3)
     for i in range(3):
         predicted[i] = R[0, i] * m[0] + R[1, i] * m[1] + R[2, i] * m[2]
@@ -352,16 +438,11 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
             for j in range(3):
                 noise[i, j] *= more
             noise[i, i] += slow * more
-        _measure(q, x, P, H, r, HP, S, noise)
+        _measure(q, x, P, H, r, HP, S, noise, learned)
     else:
         k[MAG_REJECTED_S] += dt
         if k[MAG_REJECTED_S] > s.recovery:
             k[MAG_REJECTED_S], k[NORTH_SET] = 0.0, 0.0  # the next reading sets it anew
-    if s.learn_hard_iron:
-        for i in range(3):
-            P[IRON + i, IRON + i] += k[DISTURBANCE] * dt / IRON_OPENS_S
-            if learned:
-                P[FIELD + i, FIELD + i] += k[DISTURBANCE] * dt / FIELD_OPENS_S
     return believed
 
 
@@ -378,8 +459,7 @@ def run(q, x, P, k, t, gyro, force, mag, reference, variance, has_reference, lea
         dt = t[n] - k[T] if isfinite(k[T]) else 0.0
         if dt > 0.0:
             for i in range(3):
-                now = gyro[n, i] if has_gyro else k[LAST_GYRO + i]
-                rate[i] = 0.5 * (k[LAST_GYRO + i] + now) - x[i]
+                rate[i] = (gyro[n, i] if has_gyro else k[LAST_GYRO + i]) - x[i]  # a reading is the mean since the last
                 now = force[n, i] if has_force else k[LAST_FORCE + i]
                 pulled[i] = 0.5 * (k[LAST_FORCE + i] + now)
             fresh = has_force or t[n] - k[T_FORCE] < s.gyro_gap
@@ -418,16 +498,20 @@ def run(q, x, P, k, t, gyro, force, mag, reference, variance, has_reference, lea
                     )
                     out[3][n, 1] = k[DISTURBANCE] > s.disturbed**2 or not out[3][n, 0]
                 k[T_MAG] = t[n]
-        _write(n, q, x, P, k, learned, out)
+        _write(n, q, x, P, k, learned, s.gyro_delay, out)
 
 
 @njit(cache=True, nogil=True)
-def _write(n, q, x, P, k, learned, out):  # type: ignore[no-untyped-def]
+def _write(n, q, x, P, k, learned, lead, out):  # type: ignore[no-untyped-def]
     """One row: where the field is learned, yaw counts from its azimuth, and yaw's variance is of that difference."""
     shown, R, J = empty(4), empty((3, 3)), zeros((3, SIZE))
     for i in range(4):
         shown[i] = q[i]
-    building_from_body(q, R)
+    if lead > 0.0:
+        advance(
+            shown, lead * (k[LAST_GYRO] - x[0]), lead * (k[LAST_GYRO + 1] - x[1]), lead * (k[LAST_GYRO + 2] - x[2])
+        )
+    building_from_body(shown, R)
     for i in range(3):
         J[i, i] = 1.0
     if learned and k[NORTH_SET] > 0.0:

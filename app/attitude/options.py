@@ -20,7 +20,8 @@ class AttitudeOptions:
     """Standard deviations per axis, and times; the defaults suit phones and body sensors.
 
     Gyro: white noise density, random walk of the bias (Kuevor's sigma_v, sigma_u), bias at the start, error in scale as
-    a fraction of the rate. `gyro_gap_s`: a sample holds this long; beyond it the rate is unknown with
+    a fraction of the rate, and the group delay of its low-pass filter, by which the attitude told leads the readings
+    (2.5 ms is what common chips state for bandwidths near 200 Hz). `gyro_gap_s`: a sample holds this long; beyond it the rate is unknown with
     `unknown_rate_rad_per_s`.
 
     translation "bounded" integrates the accelerometer to a velocity which is known to stay small (`speed_m_per_s`,
@@ -39,6 +40,7 @@ class AttitudeOptions:
     gyro_bias_walk_rad_per_s_sqrt_s: float = 2e-5
     gyro_bias_rad_per_s: float = 0.01
     gyro_scale: float = 0.003
+    gyro_delay_s: float = 0.0025
     gyro_gap_s: float = 0.25
     unknown_rate_rad_per_s: float = 1.0
     translation: Literal["bounded", "ignored"] = "bounded"
@@ -50,10 +52,10 @@ class AttitudeOptions:
     accelerometer_gate: float = 21.1
     gravity_m_per_s2: float = 9.81
     magnetometer_uT: float = 0.7
-    field_uT: float = 1.0
-    field_correlation_s: float = 1.0
+    field_uT: float = 2.0
+    field_correlation_s: float = 5.0
     field_walk_uT_per_sqrt_s: float = 0.05
-    hard_iron_uT: float = 2.0
+    hard_iron_uT: float = 0.5
     hard_iron_walk_uT_per_sqrt_s: float = 0.01
     learn_hard_iron: bool = True
     magnetometer_delay_s: float = 0.005
@@ -75,6 +77,7 @@ class Tuning(NamedTuple):
     gyro_noise: float
     bias_walk: float
     gyro_scale: float
+    gyro_delay: float
     gyro_gap: float
     unknown_rate: float
     bounded: bool
@@ -114,7 +117,7 @@ def tuning_of(options: AttitudeOptions) -> Tuning:
             message = f"options.{name} is {value}: give a finite number that is not negative"
             raise InvalidInput(message, Fault(f"/options/{name}", "negative or not finite"))
     return Tuning(
-        o.gyro_noise_rad_per_sqrt_s, o.gyro_bias_walk_rad_per_s_sqrt_s, o.gyro_scale, o.gyro_gap_s,
+        o.gyro_noise_rad_per_sqrt_s, o.gyro_bias_walk_rad_per_s_sqrt_s, o.gyro_scale, o.gyro_delay_s, o.gyro_gap_s,
         o.unknown_rate_rad_per_s, o.translation == "bounded", o.speed_m_per_s, o.speed_correlation_s,
         o.accelerometer_noise_m_per_s_sqrt_s, o.accelerometer_m_per_s2, o.accelerometer_correlation_s,
         o.accelerometer_gate, o.gravity_m_per_s2, o.magnetometer_uT, o.field_uT, o.field_correlation_s,
