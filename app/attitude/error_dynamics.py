@@ -9,7 +9,7 @@ from numpy import cos, empty, sin, sqrt
 
 __all__ = ["advance", "bias_response", "building_from_body", "process_noise", "turn_back"]
 
-SMALL_RAD = 1e-3
+SMALL_RAD = 0.02
 """Below this angle the closed forms lose digits, and their series are exact to rounding."""
 
 
@@ -24,11 +24,12 @@ def building_from_body(q, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def advance(q, a, b, c):  # type: ignore[no-untyped-def]
-    """Turn `q` (4,) in place by the rotation vector (a, b, c), rad, about the body's axes; unit length (Kuevor, 3.2)."""
+    """Turn `q` (4,) in place by a rotation vector, rad, about the body's axes; unit length (Kuevor, eq. 3.2)."""
     angle2 = a * a + b * b + c * c
     angle = sqrt(angle2)
     if angle < SMALL_RAD:
-        s, c0 = 0.5 - angle2 / 48.0, 1.0 - angle2 / 8.0 + angle2 * angle2 / 384.0
+        s = 0.5 - angle2 / 48.0 * (1.0 - angle2 / 80.0)
+        c0 = 1.0 - angle2 / 8.0 * (1.0 - angle2 / 48.0 * (1.0 - angle2 / 120.0))
     else:
         s, c0 = sin(0.5 * angle) / angle, cos(0.5 * angle)
     x, y, z = s * a, s * b, s * c
@@ -66,7 +67,7 @@ def turn_back(rate, dt, out):  # type: ignore[no-untyped-def]
     n = sqrt(n2)
     if n * dt < SMALL_RAD:
         a2 = n2 * dt * dt
-        first, second = dt * (1.0 - a2 / 6.0), dt * dt * (0.5 - a2 / 24.0)
+        first, second = dt * (1.0 - a2 / 6.0 * (1.0 - a2 / 20.0)), dt * dt * (0.5 - a2 / 24.0 * (1.0 - a2 / 30.0))
     else:
         first, second = sin(n * dt) / n, (1.0 - cos(n * dt)) / n2
     _polynomial(out, rate, 1.0, -first, second)
@@ -79,7 +80,8 @@ def bias_response(rate, dt, out):  # type: ignore[no-untyped-def]
     n = sqrt(n2)
     if n * dt < SMALL_RAD:
         a2 = n2 * dt * dt
-        second, third = dt * dt * (0.5 - a2 / 24.0), dt**3 * (1.0 / 6.0 - a2 / 120.0)
+        second = dt * dt * (0.5 - a2 / 24.0 * (1.0 - a2 / 30.0))
+        third = dt**3 * (1.0 / 6.0 - a2 / 120.0 * (1.0 - a2 / 42.0))
     else:
         second, third = (1.0 - cos(n * dt)) / n2, (n * dt - sin(n * dt)) / (n2 * n)
     _polynomial(out, rate, -dt, second, -third)
@@ -87,9 +89,9 @@ def bias_response(rate, dt, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def process_noise(noise_density, bias_walk, dt):  # type: ignore[no-untyped-def]
-    """Per axis: variance of attitude, covariance with bias, variance of bias after dt (Kuevor, B20: Upsilon Q Upsilon^T).
+    """Per axis: variance of attitude, covariance with bias, variance of bias after dt (Kuevor, B20).
 
-    rad^2, rad^2/s and (rad/s)^2. Exact without rotation; and with it for the variance of attitude to third order in dt.
+    Upsilon Q Upsilon^T: rad^2, rad^2/s, (rad/s)^2. Exact without rotation, and nearly so for turns of a few degrees.
     """
     v, u = noise_density * noise_density, bias_walk * bias_walk
     out = empty(3)

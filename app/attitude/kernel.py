@@ -183,7 +183,7 @@ def _level(q, P, force, sd):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _learn_field(q, x, P, z, sd):  # type: ignore[no-untyped-def]
-    """Set the field state from one reading z (3,) of this sd: its errors are those of attitude, hard iron and reading."""
+    """Set the field state from a reading z (3,): its errors are those of attitude, hard iron and the reading's sd."""
     R, J, reading = empty((3, 3)), zeros((3, SIZE)), empty(3)
     building_from_body(q, R)
     for i in range(3):
@@ -325,8 +325,8 @@ def _disturbance(x, k, R, z, m, S, dt, s):  # type: ignore[no-untyped-def]
 def _blame_device(x, P, k, R, z, dt, s):  # type: ignore[no-untyped-def]
     """Learn the hard iron anew where it explains what was read lately.
 
-    Least squares of R z = m + R h over the last seconds, by sums that fade: a magnet on the device turns with it, one in
-    the room does not. Without rotation the two cannot be told apart, and nothing changes.
+    Least squares of R z = m + R h over the last seconds, by sums that fade: a magnet on the device turns with it, one
+    in the room does not. Without rotation the two cannot be told apart, and nothing changes.
     """
     fade = exp(-dt / BLAME_S)
     k[SUM_WEIGHT] = fade * k[SUM_WEIGHT] + 1.0
@@ -508,9 +508,7 @@ def _write(n, q, x, P, k, learned, lead, out):  # type: ignore[no-untyped-def]
     for i in range(4):
         shown[i] = q[i]
     if lead > 0.0:
-        advance(
-            shown, lead * (k[LAST_GYRO] - x[0]), lead * (k[LAST_GYRO + 1] - x[1]), lead * (k[LAST_GYRO + 2] - x[2])
-        )
+        advance(shown, lead * (k[LAST_GYRO] - x[0]), lead * (k[LAST_GYRO + 1] - x[1]), lead * (k[LAST_GYRO + 2] - x[2]))
     building_from_body(shown, R)
     for i in range(3):
         J[i, i] = 1.0

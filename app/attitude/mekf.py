@@ -8,7 +8,7 @@ hold with the corrections of Part 4 (4.5, 4.6): one time index, squared sigmas. 
 and the place's, gates, Joseph's form, velocity, a learned field and hard iron (`kernel`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,12 +143,10 @@ def follow_attitude(
     rows, variance = (np.zeros((1, 3)), np.zeros((1, 3, 3))) if reference is None else reference.rows(n)
     arrays = tuple(each.copy() for each in (state.q_body_to_building, state.mean, state.joint_covariance, state.kept))
     out = (np.empty((n, 4)), np.empty((n, 3, 3)), np.empty((n, 3)), np.zeros((n, 3), dtype=np.bool_))
-    kernel.run(
-        *arrays, *(np.ascontiguousarray(each, dtype=np.float64) for each in (
-            samples.t_s, samples.gyro_rad_per_s, samples.accelerometer_m_per_s2, samples.magnetometer_uT)),
-        rows, variance, reference is not None, reference is not None and reference.B_uT is None, tuning, out,
-    )  # fmt: skip
+    learned = reference is not None and reference.B_uT is None
+    streams = (samples.t_s, samples.gyro_rad_per_s, samples.accelerometer_m_per_s2, samples.magnetometer_uT)
+    t, gyro, force, field = (np.ascontiguousarray(each, dtype=np.float64) for each in streams)
+    q, mean, P, kept = arrays
+    kernel.run(q, mean, P, kept, t, gyro, force, field, rows, variance, reference is not None, learned, tuning, out)
     used, disturbed, accelerometer = out[3].T
-    return replace(state, q_body_to_building=arrays[0], mean=arrays[1], joint_covariance=arrays[2], kept=arrays[3]), (
-        AttitudeRun(out[0], out[1], out[2], used, disturbed, accelerometer)
-    )
+    return AttitudeState(q, mean, P, kept), AttitudeRun(out[0], out[1], out[2], used, disturbed, accelerometer)

@@ -21,8 +21,8 @@ class AttitudeOptions:
 
     Gyro: white noise density, random walk of the bias (Kuevor's sigma_v, sigma_u), bias at the start, error in scale as
     a fraction of the rate, and the group delay of its low-pass filter, by which the attitude told leads the readings
-    (2.5 ms is what common chips state for bandwidths near 200 Hz). `gyro_gap_s`: a sample holds this long; beyond it the rate is unknown with
-    `unknown_rate_rad_per_s`.
+    (2.5 ms is what common chips state for bandwidths near 200 Hz). `gyro_gap_s`: a sample holds this long; beyond it
+    the rate is unknown with `unknown_rate_rad_per_s`.
 
     translation "bounded" integrates the accelerometer to a velocity which is known to stay small (`speed_m_per_s`,
     forgotten over `speed_correlation_s`), so that what pulls over a second cancels when it stops; "ignored" takes every
@@ -55,13 +55,13 @@ class AttitudeOptions:
     field_uT: float = 2.0
     field_correlation_s: float = 5.0
     field_walk_uT_per_sqrt_s: float = 0.05
-    hard_iron_uT: float = 0.5
+    hard_iron_uT: float = 0.3
     hard_iron_walk_uT_per_sqrt_s: float = 0.01
     learn_hard_iron: bool = True
     magnetometer_delay_s: float = 0.005
     magnetometer_gate: float = 21.1
     disturbed_uT: float = 4.0
-    disturbance_memory_s: float = 3.0
+    disturbance_memory_s: float = 2.0
     rest_detection: bool = True
     rest_gyro_rad_per_s: float = 0.035
     rest_accelerometer_m_per_s2: float = 0.3

@@ -1,10 +1,10 @@
 """What the magnetometer is compared with: Kuevor's four references, a level one, and a field that is learned.
 
-    no reference      `None`                        gyro and accelerometer only (Kuevor's first row)
-    constant          `constant_reference`          the world model, or one point of a map
-    a map             `map_reference`               the map where the device is, its variance, and that of the place
-    level             `level_reference`             horizontal and vertical strength: yaw counts from magnetic north
-    learned           `learned_reference`           nothing known: strength, dip and hard iron come from the samples
+no reference      `None`                        gyro and accelerometer only (Kuevor's first row)
+constant          `constant_reference`          the world model, or one point of a map
+a map             `map_reference`               the map where the device is, its variance, and that of the place
+level             `level_reference`             horizontal and vertical strength: yaw counts from magnetic north
+learned           `learned_reference`           nothing known: strength, dip and hard iron come from the samples
 """
 
 from dataclasses import dataclass
@@ -35,9 +35,11 @@ class MagneticReference:
             raise InvalidInput(message, Fault("/reference/B_uT", "shape"))
         variance = _matrices(np.asarray(self.variance_uT2, dtype=np.float64), n)
         if variance.shape not in ((n, 3, 3), (1, 3, 3)):
-            message = f"the reference's variance has shape {np.shape(self.variance_uT2)}: give (3,), (n, 3) or (n, 3, 3)"
+            message = (
+                f"the reference's variance has shape {np.shape(self.variance_uT2)}: give (3,), (n, 3) or (n, 3, 3)"
+            )
             raise InvalidInput(message, Fault("/reference/variance_uT2", "shape"))
-        unknown = ~np.isfinite(variance).all(axis=(1, 2))
+        unknown = np.asarray(~np.isfinite(variance).all(axis=(1, 2)))
         if unknown.any():
             if len(variance) == 1:
                 raise InvalidInput("the reference's variance is not finite", Fault("/reference/variance_uT2", "finite"))
