@@ -1,0 +1,1 @@
+"""Orientation of a device, and the magnetic field it takes its heading from."""
