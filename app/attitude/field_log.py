@@ -1,4 +1,4 @@
-"""Brommer's filter over a whole log, compiled: the same steps as `app.attitude.field_filter`, which is its plain twin."""
+"""Brommer's filter over a whole log, compiled: the steps of `app.attitude.field_filter`, which is its plain twin."""
 
 from dataclasses import dataclass
 
@@ -76,7 +76,8 @@ def filter_log(
     filter_.rule.check()
     states, columns, flags, rows, x, P = _run(x, belief.covariance.copy(), filter_, t, gyro, B, force)
     return FieldLog(
-        states[:, :4], states[:, 4:7], np.sqrt(states[:, 7:]), *columns.T, flags[:, 0] == 1, flags[:, 1] == 1,
+        states[:, :4], states[:, 4:7], np.sqrt(states[:, 7:]), columns[:, 0], columns[:, 1], columns[:, 2],
+        columns[:, 3], flags[:, 0] == 1, flags[:, 1] == 1,
         flags[:, 2] == 1, gathered_events(rows), FieldBelief(x[:4], x[4:7], x[7:10], x[10:14], x[14:], P),
     )  # fmt: skip
 
