@@ -106,27 +106,29 @@ def _sudden(t: Array, B: Array) -> list[DisturbedStretch]:
         noise = 1e-3  # a sensor that repeats itself
     stuck = find_stuck(B, noise)
     at_rest = [(t[a] - AROUND_STUCK_S, t[b - 1] + AROUND_STUCK_S) for a, b in stuck]
+    all_steps = find_steps(t, B, noise)
     steps = [
         step
-        for step in find_steps(t, B, noise)
+        for step in all_steps
         if not any(t[step.after] >= from_s and t[step.before] <= to_s for from_s, to_s in at_rest)
     ]
     repeats = [
         _stretch(t, a, b - 1, "stuck", "the sensor repeats one reading while it is carried on", 0.0, STUCK_CHANCE)
         for a, b in stuck
     ]
+    known = [(step.before, step.after) for step in all_steps] + [(a - 1, min(b, len(t) - 1)) for a, b in stuck]
     hum = [
         DisturbedStretch(
             float(t[each.start]), float(t[min(each.stop, len(t)) - 1]), "hum",
             f"readings rattle by {each.sd_uT:.1f} uT, the rest of the walk by {noise:.1f}", each.sd_uT, each.p_value,
         )
-        for each in find_hum(t, B, noise, steps)
+        for each in find_hum(t, B, noise, known)
     ]  # fmt: skip
     return [*_paired(t, steps), *hum, *repeats]
 
 
 def _paired(t: Array, steps: list[Step]) -> list[DisturbedStretch]:
-    """Steps with the later one that takes them back, steps that stay, and lesser ones, which tell only of their moment."""
+    """Steps with the one that takes them back, steps that stay, and lesser ones, which tell only of their moment."""
     out, used = [], set()
     for k, step in enumerate(steps):
         if k in used:

@@ -136,8 +136,11 @@ def _stands_out(t_s: Array, B_uT: Array, before: int, after: int) -> float:
     return float(changes[before - first] / max(others.max(initial=0.0), 1e-9))
 
 
-def find_hum(t_s: Array, B_uT: Array, noise_sd_uT: float, steps: list[Step]) -> list[Hum]:
-    """Stretches whose fifth differences are too large for the walk's ordinary noise, away from steps."""
+def find_hum(t_s: Array, B_uT: Array, noise_sd_uT: float, known: list[tuple[int, int]]) -> list[Hum]:
+    """Stretches whose fifth differences are too large for the walk's ordinary noise.
+
+    `known` are samples, first and last, whose sudden changes have another name: steps, and a sensor that was stuck.
+    """
     n, c = B_uT.shape
     interval_s = float(np.median(np.diff(t_s)))
     length = max(8, round(HUM_S / interval_s))
@@ -145,8 +148,8 @@ def find_hum(t_s: Array, B_uT: Array, noise_sd_uT: float, steps: list[Step]) -> 
         return []
     squared = np.sum(np.square(_differences(B_uT)), axis=1) / c
     usable = np.ptp(sliding_window_view(t_s, ORDER + 1), axis=1) < 2.0 * ORDER * interval_s
-    for step in steps:
-        usable[max(step.before - ORDER, 0) : step.after + 1] = False
+    for first, last in known:
+        usable[max(first - ORDER, 0) : last + 1] = False
     count = np.convolve(usable, np.ones(length), "valid")
     ratio = np.convolve(squared * usable, np.ones(length), "valid") / np.maximum(count, 1.0) / noise_sd_uT**2
     freedom = np.maximum(c * count / _SHARED, 1.0)
