@@ -25,13 +25,12 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from app.attitude.departures import Expected
+from app.attitude.departures import Expected, expected_from_map
 from app.attitude.stretches import DisturbedStretch, disturbed_samples, find_disturbed_stretches
 from app.errors import IsodynError
 from app.field.fit import fit_map
-from app.field.grid import FieldGrid
 from app.field.samples import Samples
-from app.field.session_bias import estimate_session_biases, remove_session_biases
+from app.field.session_bias import estimate_session_biases, remove_session_biases, unmet_session
 from app.field.spec import MapSpec
 from app.geometry import rotate_by_quaternion
 from app.survey.indoor_location import read_indoor_location
@@ -129,13 +128,6 @@ def with_rest(walk: SyntheticWalk, at: int, rate_hz: float) -> SyntheticWalk:
     return SyntheticWalk(walk.floor, np.arange(len(order)) / rate_hz, walk.p_building_m[order], walk.heading_rad[order])
 
 
-def expected_from(grid: FieldGrid, samples: Samples) -> Expected:
-    values = grid.at(samples.p_building_m)
-    known = values.measured[:, None]
-    sd = np.hypot(values.sd_uT, grid.noise_sd_uT)
-    return Expected(np.where(known, values.mean_uT, np.nan), np.where(known, sd, np.nan), grid.error_structure)
-
-
 def synthetic_walks(count: int) -> Iterator[Tried]:
     """Walks of analytic buildings, four to each, the even ones with a rest."""
     for seed in range((count + 3) // 4):
@@ -152,7 +144,7 @@ def synthetic_walks(count: int) -> Iterator[Tried]:
             at = int(rng.integers(200, len(walk) - 200))
             sensor = replace(SENSOR, hard_iron_uT=tuple(rng.normal(0.0, HARD_IRON_UT, 3)))
             samples = survey(building, with_rest(walk, at, 10.0), sensor, rng)
-            yield Tried(samples, expected_from(grid, samples), (at / 10.0, at / 10.0 + REST_S))
+            yield Tried(samples, expected_from_map(grid, samples.p_building_m), (at / 10.0, at / 10.0 + REST_S))
 
 
 def mall_walks() -> Iterator[Tried]:
@@ -164,13 +156,18 @@ def mall_walks() -> Iterator[Tried]:
                 walks[file.name] = read_indoor_location(gzip.decompress(file.read_bytes())).samples
             except IsodynError as error:
                 print(f"{file.name}: {error}")
-        walks = remove_session_biases(walks, estimate_session_biases(walks))
+        biases = estimate_session_biases(walks)
+        left_uT = {
+            name: float(np.sqrt(np.trace((biases.get(str(walk.session)) or unmet_session(walk)).covariance_uT2) / 3.0))
+            for name, walk in walks.items()
+        }
+        walks = remove_session_biases(walks, biases)
         names = sorted(walks)
         for half in (0, 1):
             own, others = names[half::2], names[1 - half :: 2]
             grid = fit_map({name: walks[name] for name in others}, MapSpec(resolution_m=0.5)).grid
             for name in own:
-                yield Tried(walks[name], expected_from(grid, walks[name]), None)
+                yield Tried(walks[name], expected_from_map(grid, walks[name].p_building_m, left_uT[name]), None)
 
 
 def judge(tried: Tried, mapped: bool, added: Disturbance | None = None) -> tuple[DisturbedStretch, ...]:

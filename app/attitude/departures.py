@@ -7,7 +7,7 @@ statistic is compared with F, not with chi-square. Probabilities are Bonferroni'
 length and all lengths tried.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,14 +16,16 @@ from scipy.spatial import cKDTree
 from scipy.stats import f
 
 from app.field.error_structure import UNKNOWN_STRUCTURE, ErrorStructure
+from app.field.grid import FieldGrid
 from app.geometry import Array
 
-__all__ = ["Departure", "Expected", "departures", "expected_from_other_visits"]
+__all__ = ["Departure", "Expected", "departures", "expected_from_map", "expected_from_other_visits"]
 
-DEPARTURE_CHANCE = 1e-3
-"""Of calling any stretch of an undisturbed walk a departure."""
+MAP_CHANCE, VISIT_CHANCE = 1e-2, 1e-3
+"""Of calling any stretch of an undisturbed walk a departure; visits of one walk know little of how their errors err."""
 DURATIONS_S = (1.5, 3.0, 6.0, 12.0, 24.0, 48.0)
-TAIL_FREEDOM = 12.0
+MAP_TAILS, VISIT_TAILS = 25.0, 12.0
+"""Degrees of freedom of the denominator: the fewer, the heavier the tails that errors are taken to have."""
 ROBUST_SD = 1.4826
 FEWEST = 8
 MOST_OF_WALK = 0.5
@@ -40,11 +42,28 @@ class Expected:
     mean_uT, sd_uT   (n, c): the expected field, and the sd of a reading about it with all its errors; not a number
                      where nothing is known. c = 3 in the frame of the readings, or 1: the norm
     structure        how those errors hang together along the walk
+    chance, tails    of calling any stretch of an undisturbed walk a departure; degrees of freedom of the F distribution
     """
 
     mean_uT: Array
     sd_uT: Array
     structure: ErrorStructure = UNKNOWN_STRUCTURE
+    chance: float = MAP_CHANCE
+    tails: float = MAP_TAILS
+
+
+def expected_from_map(grid: FieldGrid, p_building_m: Array, more_sd_uT: float = 0.0) -> Expected:
+    """What a map leads one to expect at positions (n, 3), in its components; `more_sd_uT`: hard iron left, say.
+
+    Positions are known here, so what errors do when a pose may take them up is no concern: they hang together over the
+    distance that the map's held-out errors did.
+    """
+    values = grid.at(p_building_m)
+    known = values.measured[:, None]
+    sd_uT = np.sqrt(np.square(values.sd_uT) + np.square(grid.noise_sd_uT) + more_sd_uT**2)
+    length_m = max(grid.error_structure.walk_length_m, grid.error_correlation_m)
+    structure = replace(grid.error_structure, walk_length_m=length_m)
+    return Expected(np.where(known, values.mean_uT, np.nan), np.where(known, sd_uT, np.nan), structure)
 
 
 class Departure(NamedTuple):
@@ -73,11 +92,11 @@ def departures(t_s: Array, path_m: Array, B_uT: Array, expected: Expected) -> li
     z = miss_uT / expected.sd_uT[known]
     z /= np.maximum(ROBUST_SD * np.median(np.abs(z), axis=0), 1.0)
     t, path = t_s[known], path_m[known]
-    spans, p_values = _judged_spans(t, path, z, expected.structure)
+    spans, p_values = _judged_spans(t, path, z, expected)
     found: list[Departure] = []
     taken = np.zeros(len(known), dtype=bool)
     for k in np.argsort(p_values, kind="stable").tolist():
-        if p_values[k] > DEPARTURE_CHANCE:
+        if p_values[k] > expected.chance:
             break
         a, b = spans[k].tolist()
         if not taken[a:b].any():
@@ -86,7 +105,7 @@ def departures(t_s: Array, path_m: Array, B_uT: Array, expected: Expected) -> li
     return sorted(found)
 
 
-def _judged_spans(t_s: Array, path_m: Array, z: Array, structure: ErrorStructure) -> tuple[NDArray[np.intp], Array]:
+def _judged_spans(t_s: Array, path_m: Array, z: Array, expected: Expected) -> tuple[NDArray[np.intp], Array]:
     """Spans (k, 2) of samples of every duration tried, a quarter of it apart, and their p-values (k,)."""
     total = np.vstack([np.zeros(z.shape[1]), np.cumsum(z, axis=0)])
     whole_s = float(t_s[-1] - t_s[0])
@@ -102,9 +121,11 @@ def _judged_spans(t_s: Array, path_m: Array, z: Array, structure: ErrorStructure
             continue
         count = (stop - start)[:, None]
         mean = (total[stop] - total[start]) / count
-        variance = _variance_of_mean(count[:, 0].astype(np.float64), path_m[stop - 1] - path_m[start], structure)
+        variance = _variance_of_mean(
+            count[:, 0].astype(np.float64), path_m[stop - 1] - path_m[start], expected.structure
+        )
         statistic = np.sum(np.square(mean), axis=1) / (variance * z.shape[1])
-        chance = f.sf(statistic, z.shape[1], TAIL_FREEDOM) * len(durations) * whole_s / duration
+        chance = f.sf(statistic, z.shape[1], expected.tails) * len(durations) * whole_s / duration
         spans.append(np.stack([start, stop], axis=1))
         p_values.append(chance)
     return np.concatenate(spans), np.concatenate(p_values)
@@ -133,4 +154,4 @@ def expected_from_other_visits(
             distance = float(np.mean(np.sort(away)[:5])) + 0.1
             mean[k] = B_uT[nearest].mean(axis=0)
             sd[k] = np.sqrt(2.0 * (noise_sd_uT**2 + floor**2) + (gradient_uT_per_m * distance) ** 2)
-    return Expected(mean, sd)
+    return Expected(mean, sd, chance=VISIT_CHANCE, tails=VISIT_TAILS)
