@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from app import __version__
 from app.api import (
+    attitudes,
     buildings,
     calibrations,
     floors,
@@ -143,6 +144,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         replay,
         reference_field,
         calibrations,
+        attitudes,
         jobs,
     ):
         app.include_router(part.router)

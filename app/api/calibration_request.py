@@ -12,9 +12,11 @@ from app.api.locate_request import FloorId, Quaternion, Vector
 from app.api.models import Finite, Name, Point, RequestModel
 from app.services.calibrate import CIRCLE_METHODS, Asked, MappedWalk, Place
 
-__all__ = ["CalibrationId", "DeviceQuery", "NewCalibration"]
+__all__ = ["CalibrationId", "DeviceQuery", "Method", "NewCalibration"]
 
 MOST_READINGS = 50_000
+MOST_WALKED = 5_000
+"""Readings of a walk that is searched for."""
 Method = Literal["two_step", "ellipsoid", "modified_ellipsoid", "strict_ellipse", "swinging", "map_aided"]
 
 CalibrationId = Annotated[
@@ -51,14 +53,42 @@ class ReferenceBody(RequestModel):
 
 
 class WalkBody(RequestModel):
-    """A walk through a mapped building, for method map_aided: a row for each reading."""
+    """A walk through a mapped building, for method map_aided: a row for each reading.
 
-    floor_id: FloorId
+    With position_m, where it was is told. Without, the map finds it: then displacement_m and orientation are in the
+    level frame of the first reading, and 40 to 100 m with turns serve best.
+    """
+
+    floor_id: Annotated[FloorId | None, Field(description="the floor it was on")] = None
+    building_id: Annotated[FloorId | None, Field(description="instead, without position_m: any floor of it")] = None
     orientation: Annotated[
-        list[Quaternion], Field(max_length=MOST_READINGS, description="body to building, [w, x, y, z]")
-    ]
-    position_m: Annotated[list[Point], Field(max_length=MOST_READINGS, description="in the building frame")]
+        list[Quaternion],
+        Field(max_length=MOST_READINGS, description="[w, x, y, z], the sensor's axes to the building, or the level "
+              "frame of the first reading"),
+    ]  # fmt: skip
+    position_m: Annotated[list[Point] | None, Field(max_length=MOST_READINGS, description="in the building frame")] = (
+        None
+    )
     position_sd_m: Annotated[Finite, Field(ge=0, le=20)] = 0.3
+    displacement_m: Annotated[
+        list[Point] | None, Field(max_length=MOST_WALKED, description="from the first reading")
+    ] = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.position_m is None) == (self.displacement_m is None):
+            raise ValueError("send position_m, or displacement_m where nobody knows where it was")
+        if (self.floor_id is None) == (self.building_id is None):
+            raise ValueError("send floor_id, or building_id where nobody knows the floor")
+        if self.position_m is not None and self.floor_id is None:
+            raise ValueError("position_m is on a floor: send floor_id")
+        return self
+
+    @property
+    def way(self) -> list[list[float]]:
+        told = self.position_m if self.position_m is not None else self.displacement_m
+        assert told is not None
+        return told
 
 
 class NewCalibration(RequestModel):
@@ -94,8 +124,8 @@ class NewCalibration(RequestModel):
         if self.method == "map_aided":
             if self.walk is None:
                 raise ValueError("map_aided needs walk: where the device was, and how it was held")
-            if not len(self.walk.orientation) == len(self.walk.position_m) == len(self.b_ut):
-                raise ValueError("walk has as many orientations and positions as there are readings in b_ut")
+            if not len(self.walk.orientation) == len(self.walk.way) == len(self.b_ut):
+                raise ValueError("walk has as many orientations and places as there are readings in b_ut")
             return self
         if self.walk is not None:
             raise ValueError("walk is for method map_aided")
@@ -119,10 +149,12 @@ class NewCalibration(RequestModel):
             place = Place(told.building_id, told.latitude_deg, told.longitude_deg, told.height_m, on, told.z_axis)
         if self.walk is not None:
             walk = MappedWalk(
-                self.walk.floor_id,
-                np.asarray(self.walk.orientation, dtype=np.float64),
-                np.asarray(self.walk.position_m, dtype=np.float64),
-                self.walk.position_sd_m,
+                floor_id=self.walk.floor_id,
+                building_id=self.walk.building_id,
+                q=np.asarray(self.walk.orientation, dtype=np.float64),
+                way_m=np.asarray(self.walk.way, dtype=np.float64),
+                known=self.walk.position_m is not None,
+                position_sd_m=self.walk.position_sd_m,
             )
         return Asked(
             method=self.method,

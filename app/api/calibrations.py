@@ -1,8 +1,9 @@
 """Calibrations of a device's magnetometer: make one, list them, compare them. A calibration never changes."""
 
+from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -11,16 +12,16 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.api.auth import Calibrating, Measuring
-from app.api.calibration_request import NewCalibration
+from app.api.calibration_request import Method, NewCalibration
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
 from app.api.listing import Page, PagingDep, list_page
-from app.api.models import Id, Name
+from app.api.models import Finite, Id, Name
 from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Calibration
 from app.services.calibrate import calibrate
-from app.services.calibrations import record_calibration
+from app.services.calibrations import compare_devices, device_drift, record_calibration
 
 __all__ = ["router"]
 
@@ -66,6 +67,38 @@ class CalibrationView(BaseModel):
     created_at: datetime
 
 
+class DriftView(BaseModel):
+    """A device's calibrations by one method over time: are they one and the same, and how fast do they change?"""
+
+    device: str
+    method: str
+    calibration_ids: list[str]
+    mean: dict[str, float]
+    mean_sd: dict[str, float]
+    rate_per_day: Annotated[dict[str, float] | None, Field(description="null: all of one time")]
+    rate_sd_per_day: dict[str, float] | None
+    chi2: float
+    degrees: int
+    p_same: Annotated[float, Field(description="of as much scatter by chance, were they one and the same")]
+    p_line: Annotated[float | None, Field(description="of what scatters about the trend; null with fewer than three")]
+    drifting: Annotated[list[str], Field(description="parameters whose rates chance does not explain")]
+    words: str
+
+
+class ComparisonView(BaseModel):
+    """A field read by the second device and corrected as the first's: by how much it errs, over all directions."""
+
+    first_id: str
+    second_id: str
+    worst_ut: float
+    rms_ut: float
+    worst_5_ut: Annotated[float, Field(description="the true worst error is above it with 95 % probability")]
+    worst_95_ut: Annotated[float, Field(description="the true worst error is below it with 95 % probability")]
+    p_same: float | None
+    verdict: Literal["equivalent", "different", "not known"]
+    words: str
+
+
 def show_calibration(row: Calibration) -> CalibrationView:
     names = ("id", "device", "version", "method", "model", "reference", "measured_at", "created_at")
     return CalibrationView.model_validate({name: getattr(row, name) for name in names} | row.fit)
@@ -103,6 +136,38 @@ def list_calibrations(
         own = own.where(Calibration.device == device)
     with context.transaction() as session:
         return list_page(session, own, Calibration.id, paging, show_calibration)
+
+
+@router.get("/calibrations:drift", summary="How a device's calibrations change over time")
+def get_drift(
+    context: ContextDep,
+    identity: Measuring,
+    device: Annotated[Name, Query(examples=["robot-7"])],
+    method: Annotated[Method | None, Query(description="default: that of its newest")] = None,
+) -> DriftView:
+    with context.transaction() as session:
+        drift, ids = device_drift(session, identity.organisation_id, device, method)
+        by = session.get_one(Calibration, ids[0]).method
+    return DriftView(device=device, method=by, calibration_ids=ids, **asdict(drift))
+
+
+@router.get("/calibrations:compare", summary="Are two devices equivalent, by their calibrations?")
+def get_comparison(
+    context: ContextDep,
+    identity: Measuring,
+    first_id: Annotated[str, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")],
+    second_id: Annotated[str, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")],
+    magnitude_ut: Annotated[Finite, Query(gt=1, le=200, description="of the field it is asked for")] = 50.0,
+    tolerance_ut: Annotated[Finite, Query(gt=0, le=100, description="what is equivalent enough")] = 1.0,
+) -> ComparisonView:
+    """Equivalent: with 95 % confidence they differ by less than the tolerance; different: by more; else not known, and
+    better calibrations would tell. Both by one method."""
+    with context.transaction() as session:
+        told = compare_devices(session, identity.organisation_id, (first_id, second_id), magnitude_ut, tolerance_ut)
+    return ComparisonView(
+        first_id=first_id, second_id=second_id,
+        **{name.replace("_uT", "_ut"): value for name, value in asdict(told).items()},
+    )  # fmt: skip
 
 
 @router.get("/calibrations/{calibration_id}", summary="One calibration")

@@ -19,7 +19,10 @@ from app.calibration.two_step import two_step
 from app.db.tables import Building
 from app.earth_field import EarthField, earth_field
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
+from app.field.grid import FieldGrid
 from app.geometry import Array
+from app.positioning.window import Window
+from app.services.calibrate_on_map import calibrate_on_map
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
 
@@ -31,6 +34,8 @@ CIRCLE_METHODS = ("modified_ellipsoid", "strict_ellipse", "swinging")
 _CIRCLES = {"modified_ellipsoid": modified_ellipsoid, "strict_ellipse": strict_ellipse, "swinging": swinging}
 _SPHERES = {"ellipsoid": ellipsoid, "two_step": two_step}
 LEAST_MAPPED = 30
+NEARLY_UNIT = 0.1
+NOISE_UT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +52,17 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedWalk:
-    """Attitudes (n, 4), body to building, and positions (n, 3) in the building of a walk on a mapped floor."""
+    """A walk through a mapped building, on one floor or on any of a building.
 
-    floor_id: str
-    q_body_to_building: Array
-    p_building_m: Array
+    known    whether the way (n, 3) is positions in the building, and q (n, 4) turns the sensor's axes to it; else both
+             are of the level frame of the first reading, and the map has to find where that was
+    """
+
+    floor_id: str | None
+    building_id: str | None
+    q: Array
+    way_m: Array
+    known: bool
     position_sd_m: float
 
 
@@ -116,34 +127,64 @@ def _earth(session: Session, organisation_id: str, place: Place) -> EarthField:
 def _on_a_map(
     session: Session, grids: GridCache, organisation_id: str, asked: Asked, walk: MappedWalk
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
-    maps = active_maps(session.connection(), organisation_id, floor_ids=[walk.floor_id])
+    _check_unit(walk.q)
+    maps = active_maps(
+        session.connection(), organisation_id, building_id=walk.building_id,
+        floor_ids=None if walk.floor_id is None else [walk.floor_id],
+    )  # fmt: skip
     if not maps:
         raise Conflict(f"floor {walk.floor_id} has no map yet; upload surveys and wait for its job")
-    grid = grids.grid(maps[0].grid_sha256)
+    readings = {"b_ut": asked.B_uT, "orientation": walk.q, "way_m": walk.way_m}
+    rotation = Rotation.from_quat(walk.q, scalar_first=True).as_matrix()
+    if walk.known:
+        fit, reference = _along(grids.grid(maps[0].grid_sha256), asked.B_uT, rotation, walk)
+        return fit, reference | {"floor_id": maps[0].floor_id, "map_id": maps[0].map_id}, readings
+    window = Window(
+        frame="level", B_uT=np.einsum("nij,nj->ni", rotation, asked.B_uT), displacement_m=walk.way_m - walk.way_m[0],
+        noise_uT=NOISE_UT,
+        device_to_frame=rotation,
+    )  # fmt: skip
+    found = calibrate_on_map(window, grids.searchable([(each.floor_id, each.grid_sha256) for each in maps]))
+    if found.fix.status != "fix":
+        reason = f"where the walk went is not found: {found.fix.reason or found.fix.status}"
+        raise InvalidInput(
+            f"{reason}; walk farther, with turns, where surveyors walked", Fault("/body/walk/displacement_m", reason)
+        )
+    here = next(each for each in maps if each.floor_id == found.floor_id)
+    told = {"floor_id": here.floor_id, "map_id": here.map_id, "ended_at_m": found.way.position_m[-1].tolist()}
+    return found.fit, told, readings
+
+
+def _along(grid: FieldGrid, B_uT: Array, rotation: Array, walk: MappedWalk) -> tuple[CalibrationFit, dict[str, Any]]:
+    """By positions that were told, where the map has measured."""
     if grid.components != "vector":
         raise IncompatibleFrames(
             f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
         )
-    values = grid.at(walk.p_building_m)
+    values = grid.at(walk.way_m)
     kept = values.measured
     if kept.sum() < LEAST_MAPPED:
-        reason = (
-            f"{int(kept.sum())} of {len(kept)} readings were taken where the floor is mapped, {LEAST_MAPPED} are needed"
+        reason = f"{int(kept.sum())} of {len(kept)} readings were taken where the floor is mapped"
+        raise InvalidInput(
+            f"{reason}, {LEAST_MAPPED} are needed; walk where surveyors walked", Fault("/body/walk/position_m", reason)
         )
-        raise InvalidInput(f"{reason}; walk where surveyors walked", Fault("/body/walk/position_m", reason))
     slope = values.gradient_uT_per_m[kept][:, :, :2]
     fit = map_aided(
-        asked.B_uT[kept],
-        Rotation.from_quat(walk.q_body_to_building[kept], scalar_first=True).as_matrix(),
+        B_uT[kept],
+        rotation[kept],
         values.mean_uT[kept],
         values.sd_uT[kept] ** 2 + walk.position_sd_m**2 * (slope**2).sum(axis=2),
-        path_m=_path_m(walk.p_building_m[kept]),
+        path_m=_path_m(walk.way_m[kept]),
     )
-    readings = {
-        "b_ut": asked.B_uT, "orientation": walk.q_body_to_building, "position_m": walk.p_building_m,
-    }  # fmt: skip
-    reference = {"floor_id": walk.floor_id, "map_id": maps[0].map_id, "position_sd_m": walk.position_sd_m}
-    return fit, reference | {"mapped_readings": int(kept.sum())}, readings
+    return fit, {"position_sd_m": walk.position_sd_m, "mapped_readings": int(kept.sum())}
+
+
+def _check_unit(q: Array) -> None:
+    wrong = np.abs(np.linalg.norm(q, axis=1) - 1.0) > NEARLY_UNIT
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        reason = f"its norm is {np.linalg.norm(q[at]):.3g}, not 1"
+        raise InvalidInput(f"orientation {at} is no unit quaternion", Fault(f"/body/walk/orientation/{at}", reason))
 
 
 def _path_m(p_m: Array) -> Array:

@@ -10,6 +10,9 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.blobs import BlobStore
+from app.calibration.coverage import OrientationCoverage
+from app.calibration.drift import Drift, fit_drift
+from app.calibration.equivalence import EquivalentCalibrations, compare_calibrations
 from app.calibration.fit import CalibrationFit
 from app.calibration.sensor_model import SensorModel
 from app.db.tables import Calibration
@@ -17,7 +20,16 @@ from app.errors import Fault, InvalidInput, NotFound
 from app.geometry import Array
 from app.services.artefacts import pack
 
-__all__ = ["AppliedCalibration", "applied", "find_calibration", "model_as_json", "record_calibration", "stored_model"]
+__all__ = [
+    "AppliedCalibration",
+    "applied",
+    "compare_devices",
+    "device_drift",
+    "find_calibration",
+    "model_as_json",
+    "record_calibration",
+    "stored_model",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +117,56 @@ def record_calibration(
     session.add(row)
     session.flush()  # two at once: the later one breaks the unique version, and is tried again
     return row
+
+
+def device_drift(session: Session, organisation_id: str, device: str, method: str | None) -> tuple[Drift, list[str]]:
+    """How a device's calibrations by one method (default: its newest's) change over time, and their ids.
+
+    Raises NotFound for a device without any, InvalidInput for a single one.
+    """
+    of_device = select(Calibration).where(Calibration.organisation_id == organisation_id, Calibration.device == device)
+    rows = session.scalars(of_device.order_by(Calibration.version)).all()
+    if not rows:
+        raise NotFound(f"device {device} has no calibration yet; make one by POST /v1/calibrations")
+    method = method or rows[-1].method
+    rows = [row for row in rows if row.method == method]
+    if len(rows) < 2:
+        reason = f"device {device} has {len(rows)} calibration by {method}; a drift takes two: calibrate it again"
+        raise InvalidInput(reason, Fault("/query/device", reason))
+    days = [row.measured_at.timestamp() / 86_400.0 for row in rows]
+    return fit_drift(days, [_stored_fit(row) for row in rows]), [row.id for row in rows]
+
+
+def compare_devices(
+    session: Session, organisation_id: str, ids: tuple[str, str], magnitude_uT: float, tolerance_uT: float
+) -> EquivalentCalibrations:
+    """Whether two calibrations, of two devices or of one, come to the same. Raises NotFound, InvalidInput."""
+    rows = [session.get(Calibration, each) for each in ids]
+    for calibration_id, row in zip(ids, rows, strict=True):
+        if row is None or row.organisation_id != organisation_id:
+            raise NotFound(f"no calibration {calibration_id}")
+    first, second = (_stored_fit(row) for row in rows if row is not None)
+    return compare_calibrations(first, second, magnitude_uT, tolerance_uT, np.random.default_rng(0))
+
+
+def _stored_fit(row: Calibration) -> CalibrationFit:
+    told = row.fit
+    coverage = told["coverage"]
+    return CalibrationFit(
+        method=row.method,
+        model=stored_model(row.model),
+        parameters=told["parameters"],
+        parameter_sd=told["parameter_sd"],
+        covariance=np.asarray(told["covariance"], dtype=np.float64),
+        residual_rms_uT=told["residual_rms_ut"],
+        residual_max_uT=told["residual_max_ut"],
+        samples=told["samples"],
+        outliers=told["outliers"],
+        coverage=OrientationCoverage(**{**coverage, "unseen_axes": tuple(coverage["unseen_axes"])}),
+        determined=tuple(told["determined"]),
+        undetermined=tuple(told["undetermined"]),
+        advice=tuple(told["advice"]),
+    )
 
 
 def _fit_as_json(fit: CalibrationFit) -> dict[str, Any]:

@@ -286,3 +286,59 @@ def test_scopes(service: Any, key_with: Callable[..., dict[str, str]]) -> None:
     for scope, status in (("map:read", 403), ("survey:write", 201), ("locate", 201)):
         assert service.http.post("/v1/calibrations", json=asked, headers=key_with(scope)).status_code == status
         assert service.http.get("/v1/calibrations", headers=key_with(scope)).status_code == 200
+
+
+def test_a_phone_is_calibrated_by_a_walk_nobody_told_the_way_of(
+    service: Any, building: str, mapped_floor: str, walked: Any
+) -> None:
+    readings, p, q = walked(seed=3, n=500)
+    kept = slice(None, None, 3)
+    start = Rotation.from_quat(q[0], scalar_first=True).as_euler("ZYX")[0]
+    level = Rotation.from_euler("z", -start)
+    walk = {
+        "building_id": building,
+        "orientation": (level * Rotation.from_quat(q[kept], scalar_first=True)).as_quat(scalar_first=True).tolist(),
+        "displacement_m": level.apply(p[kept] - p[0]).tolist(),
+    }
+    answer = calibrate(
+        service, device="lost", method="map_aided", reference=None, walk=walk, b_ut=readings[kept].tolist()
+    )
+    assert answer.status_code == 201, answer.text
+    made = answer.json()
+    assert made["reference"]["floor_id"] == mapped_floor
+    assert np.hypot(*(np.array(made["reference"]["ended_at_m"]) - p[kept][-1, :2])) < 0.6
+    np.testing.assert_allclose(made["model"]["hard_iron_ut"], HARD_IRON, atol=3.0)
+    flat = {**walk, "displacement_m": [[0.0, 0.0, 0.0]] * len(p[kept])}
+    answer = calibrate(
+        service, device="lost", method="map_aided", reference=None, walk=flat, b_ut=readings[kept].tolist()
+    )
+    assert answer.status_code == 422, "standing still tells nothing"
+
+
+def test_drift_and_equivalence(service: Any) -> None:
+    made = [
+        calibrate(service, device="drifting", b_ut=(np.array(turned(seed=k)) + [0.5 * k, 0, 0]).tolist(),
+                  measured_at=f"2026-03-{2 + 7 * k:02d}T12:00:00Z").json()
+        for k in range(3)
+    ]  # fmt: skip
+    told = service.http.get("/v1/calibrations:drift", params={"device": "drifting"})
+    assert told.status_code == 200, told.text
+    drift = told.json()
+    assert drift["calibration_ids"] == [each["id"] for each in made]
+    rate = next(value for name, value in drift["rate_per_day"].items() if "x" in name and "ut" in name)
+    assert rate == pytest.approx(0.5 / 7.0, rel=0.15)
+    assert drift["drifting"]
+    assert drift["p_same"] < 0.01
+    same = calibrate(service, device="steady").json()
+    again = calibrate(service, device="steady too", b_ut=turned(seed=5)).json()
+    path = "/v1/calibrations:compare"
+    alike = service.http.get(path, params={"first_id": same["id"], "second_id": again["id"]}).json()
+    assert (alike["verdict"], alike["worst_ut"] < 0.2) == ("equivalent", True)
+    unlike = service.http.get(
+        path, params={"first_id": same["id"], "second_id": made[2]["id"], "tolerance_ut": 0.5}
+    ).json()  # fmt: skip
+    assert unlike["verdict"] == "different"
+    assert unlike["worst_ut"] == pytest.approx(1.0, abs=0.25)
+    for asked, status in (({"device": "steady"}, 422), ({"device": "nobody"}, 404)):
+        assert service.http.get("/v1/calibrations:drift", params=asked).status_code == status
+    assert service.http.get(path, params={"first_id": same["id"], "second_id": "nope"}).status_code == 404

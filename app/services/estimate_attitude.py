@@ -1,0 +1,127 @@
+"""An orientation from inertial and magnetic samples, against the reference that was asked for."""
+
+from dataclasses import dataclass
+from datetime import date
+from typing import Any, Literal
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from app.attitude.mekf import AttitudeRun, begin, follow_attitude
+from app.attitude.options import AttitudeOptions, InertialSamples
+from app.attitude.reference import (
+    MagneticReference,
+    constant_reference,
+    learned_reference,
+    level_reference,
+    map_reference,
+)
+from app.db.tables import Building, Floor
+from app.earth_field import earth_field, field_in_building_uT
+from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
+from app.field.grid import FieldGrid, FieldValues
+from app.geodesy import Anchor
+from app.geometry import Array
+from app.services.grid_cache import GridCache
+from app.services.locate_window import active_maps
+
+__all__ = ["AskedReference", "ReferenceKind", "estimate_attitude", "find_reference"]
+
+ReferenceKind = Literal["none", "learned", "level", "wmm", "map_point", "map"]
+STEEL_UT = 5.0  # sd per axis by which the field of a building departs from the Earth's
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AskedReference:
+    """What the magnetometer is compared with. `position_m` (1, 3) of map_point, (n, 3) of map, sd per axis."""
+
+    kind: ReferenceKind
+    building_id: str | None
+    floor_id: str | None
+    position_m: Array | None
+    position_sd_m: float
+    horizontal_uT: float | None
+    vertical_uT: float | None
+    on: date
+
+
+def estimate_attitude(
+    samples: InertialSamples, reference: MagneticReference | None, options: AttitudeOptions
+) -> AttitudeRun:
+    """What is known after every sample. Raises InvalidInput."""
+    _, run = follow_attitude(begin(samples, reference, options), samples, reference, options)
+    return run
+
+
+def find_reference(
+    session: Session, grids: GridCache, organisation_id: str, asked: AskedReference
+) -> tuple[MagneticReference | None, dict[str, Any]]:
+    """The reference, and what it was, as JSON. Raises NotFound, Conflict (no map), IncompatibleFrames, InvalidInput."""
+    if asked.kind == "none":
+        return None, {}
+    if asked.kind == "learned":
+        return learned_reference(), {}
+    if asked.kind == "level":
+        assert asked.horizontal_uT is not None
+        assert asked.vertical_uT is not None
+        told = {"horizontal_ut": asked.horizontal_uT, "vertical_ut": asked.vertical_uT}
+        return level_reference(asked.horizontal_uT, asked.vertical_uT), told
+    if asked.kind == "wmm":
+        return _earth(session, organisation_id, asked)
+    return _of_map(session, grids, organisation_id, asked)
+
+
+def _earth(session: Session, organisation_id: str, asked: AskedReference) -> tuple[MagneticReference, dict[str, Any]]:
+    building_id = asked.building_id
+    if building_id is None:
+        floor = session.get(Floor, asked.floor_id)
+        if floor is None or floor.organisation_id != organisation_id:
+            raise NotFound(f"no floor {asked.floor_id}")
+        building_id = floor.building_id
+    building = session.get(Building, building_id)
+    if building is None or building.organisation_id != organisation_id:
+        raise NotFound(f"no building {building_id}")
+    if building.anchor is None:
+        reason = f"building {building_id} has no anchor: PATCH its latitude, longitude, height and bearing first"
+        raise InvalidInput(reason, Fault("/body/reference/building_id", reason))
+    anchor = Anchor(**building.anchor)
+    field = earth_field(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m, asked.on)
+    B_uT = field_in_building_uT(field, anchor)
+    return constant_reference(B_uT, STEEL_UT), {"model": field.model, "b_ut": B_uT.tolist(), "sd_ut": STEEL_UT}
+
+
+def _of_map(
+    session: Session, grids: GridCache, organisation_id: str, asked: AskedReference
+) -> tuple[MagneticReference, dict[str, Any]]:
+    assert asked.floor_id is not None
+    assert asked.position_m is not None
+    maps = active_maps(session.connection(), organisation_id, floor_ids=[asked.floor_id])
+    if not maps:
+        raise Conflict(f"floor {asked.floor_id} has no map yet; upload surveys and wait for its job")
+    grid = grids.grid(maps[0].grid_sha256)
+    if grid.components != "vector":
+        raise IncompatibleFrames(
+            f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
+        )
+    values = grid.at(asked.position_m)
+    told: dict[str, Any] = {"floor_id": asked.floor_id, "map_id": maps[0].map_id}
+    if asked.kind == "map_point":
+        if not values.measured[0]:
+            reason = "nothing is mapped at this point"
+            raise InvalidInput(reason, Fault("/body/reference/position_m", reason))
+        wander = grid.prior_sd_uT  # the field where the device is differs from that of the point by as much
+        told |= {"b_ut": values.mean_uT[0].tolist(), "sd_ut": wander.tolist()}
+        return MagneticReference(values.mean_uT[0], np.square(wander)), told
+    mapped = float(values.measured.mean())
+    return at_places(grid, values, asked.position_sd_m**2 * np.eye(2)), told | {"mapped_share": mapped}
+
+
+def at_places(grid: FieldGrid, values: FieldValues, covariance_m2: Array) -> MagneticReference:
+    """The map at places (n, 3) of which each component is uncertain by covariance_m2 (2, 2), on the floor.
+
+    Nothing is known where nothing is mapped.
+    """
+    mean = np.where(values.measured[:, None], values.mean_uT, np.nan)
+    slope = values.gradient_uT_per_m[:, :, :2]
+    sd = np.hypot(values.sd_uT, grid.noise_sd_uT)
+    return map_reference(mean, np.where(values.measured[:, None], sd, np.nan), slope, covariance_m2)

@@ -1,0 +1,188 @@
+"""Orientations over HTTP: every reference, against the truth of a simulated walk over a mapped floor."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+RATE_HZ = 50.0
+G = 9.81
+ANCHOR = {"latitude_deg": 42.294431, "longitude_deg": -83.710442, "height_m": 236.0, "bearing_deg": 2.0}
+
+
+@pytest.fixture(scope="module")
+def carried(true_field_uT: Callable[..., np.ndarray]) -> tuple[dict[str, Any], np.ndarray, Rotation]:
+    """A minute's walk over the small floor, the device tilting in the hand: the query's columns, places, attitudes."""
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 60.0, 1.0 / RATE_HZ)
+    x, y = 6.0 + 4.5 * np.sin(0.35 * t), 4.0 + 3.0 * np.sin(0.21 * t + 0.5)
+    p = np.column_stack([x, y, np.full(len(t), 1.2)])
+    angles = np.column_stack([0.3 * t + 0.4 * np.sin(0.5 * t), 0.2 * np.sin(0.7 * t), 0.3 * np.sin(0.4 * t + 1.0)])
+    truth = Rotation.from_euler("ZYX", angles)
+    turned = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
+    gyro = np.vstack([turned[:1], turned]) + [0.004, -0.003, 0.002] + rng.normal(0, 0.003, (len(t), 3))
+    acceleration = np.gradient(np.gradient(p, t, axis=0), t, axis=0) + [0.0, 0.0, G]
+    force = truth.inv().apply(acceleration) + rng.normal(0, 0.1, (len(t), 3))
+    B = truth.inv().apply(true_field_uT(x, y)) + rng.normal(0, 0.3, (len(t), 3))
+    columns: dict[str, Any] = {
+        "t_s": t.tolist(), "gyro_rad_per_s": gyro.tolist(), "accelerometer_m_per_s2": force.tolist(),
+        "magnetometer_ut": [row if k % 2 == 0 else None for k, row in enumerate(B.tolist())],
+    }  # fmt: skip
+    return columns, p, truth
+
+
+@pytest.fixture(scope="module")
+def anchored_floor(service: Any, walk_csv: Callable[..., bytes]) -> str:
+    building = service.http.post("/v1/buildings", json={"name": "Anchored", "anchor": ANCHOR}).json()["id"]
+    made = service.http.post(
+        f"/v1/buildings/{building}/floors", json={"name": "G", "ordinal": 0, "elevation_m": 0.0}
+    )  # fmt: skip
+    floor = str(made.json()["id"])
+    for seed in (1, 2, 3):
+        service.http.post(f"/v1/floors/{floor}/surveys", content=walk_csv(seed, offset_m=0.25 * seed))
+    service.run_jobs()
+    return floor
+
+
+def ask(service: Any, columns: dict[str, Any], reference: dict[str, Any], **more: object) -> Any:
+    answer = service.http.post("/v1/attitudes", json={**columns, "reference": reference, "every": 10, **more})
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def errors_deg(answer: Any, truth: Rotation) -> tuple[np.ndarray, np.ndarray]:
+    """Heading and tilt errors of the answered samples, in the building frame, after the first ten seconds."""
+    at = np.round(np.array(answer["t_s"]) * RATE_HZ).astype(int)
+    got = Rotation.from_quat(answer["orientation"], scalar_first=True)
+    off = (got * truth[at].inv()).as_rotvec(degrees=True)[at > 10 * RATE_HZ]
+    return off[:, 2], np.linalg.norm(off[:, :2], axis=1)
+
+
+def test_a_map_gives_the_right_north_where_one_vector_does_not(service: Any, anchored_floor: str, carried: Any) -> None:
+    columns, p, truth = carried
+    on_map = ask(service, columns, {"kind": "map", "floor_id": anchored_floor, "position_m": p.tolist(),
+                                    "position_sd_m": 0.1})  # fmt: skip
+    heading, tilt = errors_deg(on_map, truth)
+    rms = np.sqrt(np.mean(heading**2))
+    assert rms < 2.0
+    assert np.sqrt(np.mean(tilt**2)) < 2.0
+    assert on_map["frame"] == "building"
+    assert on_map["reference"]["mapped_share"] > 0.9
+    assert on_map["magnetometer_used_share"] > 0.8
+    point = ask(service, columns, {"kind": "map_point", "floor_id": anchored_floor, "position_m": [6.0, 4.0, 1.2]})
+    earth = ask(service, columns, {"kind": "wmm", "floor_id": anchored_floor})
+    assert earth["reference"]["model"] == "WMM-2025"
+    for other in (point, earth):
+        assert np.sqrt(np.mean(errors_deg(other, truth)[0] ** 2)) > 2.0 * rms
+        assert other["frame"] == "building"
+
+
+def test_without_a_reference_gravity_is_up_and_yaw_is_relative(service: Any, carried: Any) -> None:
+    columns, _, truth = carried
+    told = ask(service, columns, {"kind": "none"})
+    assert told["frame"] == "relative"
+    assert told["calibration"] is None
+    _, tilt = errors_deg(told, truth)
+    at = np.round(np.array(told["t_s"]) * RATE_HZ).astype(int)
+    up = Rotation.from_quat(told["orientation"], scalar_first=True).inv().apply([0, 0, 1])
+    off = np.degrees(np.arccos(np.clip(np.sum(up * truth[at].inv().apply([0, 0, 1]), axis=1), -1, 1)))
+    assert np.sqrt(np.mean(off[at > 500] ** 2)) < 3.0
+    learned = ask(service, columns, {"kind": "learned"})
+    assert learned["frame"] == "relative"
+
+
+def test_angles_and_their_sds_are_those_of_the_quaternion(service: Any, carried: Any) -> None:
+    columns, _, _ = carried
+    told = ask(service, columns, {"kind": "level", "horizontal_ut": 18.0, "vertical_ut": -42.0})
+    assert told["frame"] == "magnetic_north"
+    angles = Rotation.from_quat(told["orientation"], scalar_first=True).as_euler("ZYX")
+    for k, name in enumerate(("yaw", "pitch", "roll")):
+        np.testing.assert_allclose(told[f"{name}_rad"], angles[:, k], atol=1e-9)
+        assert min(told[f"{name}_sd_rad"]) > 0.0
+    assert np.linalg.eigvalsh(told["covariance_rad2"]).min() > 0.0
+    assert told["t_s"][-1] == columns["t_s"][-1]
+    assert len(told["t_s"]) == len(told["orientation"]) == len(columns["t_s"]) // 10 + 1
+
+
+def test_a_hard_iron_is_taken_out_by_the_devices_calibration(service: Any, anchored_floor: str, carried: Any) -> None:
+    columns, p, truth = carried
+    hard_iron = np.array([25.0, -15.0, 10.0])
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(500, 3))
+    sphere = 50.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + hard_iron
+    made = service.http.post("/v1/calibrations", json={
+        "device": "attitude phone", "method": "ellipsoid", "reference": {"magnitude_ut": 50.0},
+        "b_ut": sphere.tolist()})  # fmt: skip
+    assert made.status_code == 201, made.text
+    raw = columns | {
+        "magnetometer_ut": [None if row is None else (np.array(row) + hard_iron).tolist()
+                            for row in columns["magnetometer_ut"]]
+    }  # fmt: skip
+    reference = {"kind": "map", "floor_id": anchored_floor, "position_m": p.tolist(), "position_sd_m": 0.1}
+    calibrated = ask(service, raw, reference, device="attitude phone")
+    assert calibrated["calibration"]["id"] == made.json()["id"]
+    assert np.sqrt(np.mean(errors_deg(calibrated, truth)[0] ** 2)) < 2.0
+
+
+def test_a_magnet_held_near_is_told_and_not_believed(service: Any, anchored_floor: str, carried: Any) -> None:
+    columns, p, truth = carried
+    from_s, to_s = 30.0, 38.0
+    rows = [
+        row if row is None or not from_s <= t <= to_s else (np.array(row) + [40.0, 30.0, -20.0]).tolist()
+        for t, row in zip(columns["t_s"], columns["magnetometer_ut"], strict=True)
+    ]
+    reference = {"kind": "map", "floor_id": anchored_floor, "position_m": p.tolist(), "position_sd_m": 0.1}
+    told = ask(service, columns | {"magnetometer_ut": rows}, reference)
+    covered = sum(max(0.0, min(each["end_s"], to_s) - max(each["start_s"], from_s)) for each in told["disturbed"])
+    assert covered > 0.6 * (to_s - from_s), told["disturbed"]
+    heading, _ = errors_deg(told, truth)
+    assert np.sqrt(np.mean(heading**2)) < 6.0
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "lengths": ({"gyro_rad_per_s": [[0, 0, 0]]}, "gyro_rad_per_s"),
+    "time goes back": ({"t_s": [0.0, 0.0]}, "increase"),
+    "no gravity": ({"accelerometer_m_per_s2": [None, None]}, "gravity"),
+    "part of a row": ({"accelerometer_m_per_s2": [[0, 0], [0, 0, 9.8]]}, "accelerometer"),
+    "wmm where": ({"reference": {"kind": "wmm"}}, "building_id"),
+    "map where": ({"reference": {"kind": "map", "floor_id": "x"}}, "position_m"),
+    "map for each": ({"reference": {"kind": "map", "floor_id": "x", "position_m": [1, 2, 3]}}, "every sample"),
+    "level of what": ({"reference": {"kind": "level"}}, "horizontal_ut"),
+    "nothing to compare": ({"magnetometer_ut": [None, None]}, "magnetometer"),
+    "unknown": ({"reference": {"kind": "compass"}}, "kind"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_answered_is_refused(service: Any, case: str) -> None:
+    body, said = REFUSED[case]
+    good = {
+        "t_s": [0.0, 0.02], "gyro_rad_per_s": [[0, 0, 0]] * 2, "accelerometer_m_per_s2": [[0, 0, 9.8]] * 2,
+        "magnetometer_ut": [[18, 3, -42]] * 2, "reference": {"kind": "level", "horizontal_ut": 18, "vertical_ut": -42},
+    }  # fmt: skip
+    assert service.http.post("/v1/attitudes", json=good).status_code == 200
+    answer = service.http.post("/v1/attitudes", json=good | body)
+    assert answer.status_code == 422, answer.text
+    assert said in answer.text
+
+
+def test_of_others_nothing_is_told(
+    service: Any, anchored_floor: str, building: str, stranger: dict[str, str], new_floor: Callable[..., str]
+) -> None:
+    body = {"t_s": [0.0, 0.02], "gyro_rad_per_s": [[0, 0, 0]] * 2, "accelerometer_m_per_s2": [[0, 0, 9.8]] * 2,
+            "magnetometer_ut": [[18, 3, -42]] * 2}  # fmt: skip
+    here = {"kind": "map_point", "floor_id": anchored_floor, "position_m": [6.0, 4.0, 1.2]}
+    for reference in (here, {"kind": "wmm", "floor_id": anchored_floor}):
+        asked = body | {"reference": reference}
+        assert service.http.post("/v1/attitudes", json=asked).status_code == 200
+        assert service.http.post("/v1/attitudes", json=asked, headers=stranger).status_code == 404
+    unmapped = here | {"floor_id": new_floor()}
+    assert service.http.post("/v1/attitudes", json=body | {"reference": unmapped}).status_code == 409
+    away = here | {"position_m": [500.0, 4.0, 1.2]}
+    assert service.http.post("/v1/attitudes", json=body | {"reference": away}).status_code == 422
+    unanchored = {"kind": "wmm", "building_id": building}
+    answer = service.http.post("/v1/attitudes", json=body | {"reference": unanchored})
+    assert answer.status_code == 422
+    assert "anchor" in answer.text
