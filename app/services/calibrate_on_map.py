@@ -27,6 +27,13 @@ LEFT_UT = 1.0
 """Sd of the offset a calibrated sensor still has, in the searches after the first."""
 SHAPE_SD_M = 0.3
 """Sd of where a sample lies on a way that as a whole is right: steps are uneven, and turns err."""
+DISTORTED = 2.0
+"""Sds of the distortion, times the horizontal field, that the first search takes for noise: it changes as the device
+turns, alike over a whole leg; with less, a walk off the map explains it better than the right one.
+"""
+SPACING_M = 1.0
+"""Samples of the first search are this far apart: what an unknown distortion does is no noise that a mean would lessen.
+"""
 LEAST_SHARE = 0.5
 """Of the walk that must be where something is mapped."""
 
@@ -70,8 +77,8 @@ def calibrate_on_map(
     options = options or LocateOptions()
     turn = _device_to_frame(window)
     horizontal_uT = float(np.median([np.hypot(*floor.grid.ambient_uT[:2]) for floor in floors]))
-    distorted_uT = soft_iron_sd * horizontal_uT  # what a distortion makes of the field when the device turns
-    asked = replace(window, noise_uT=float(np.hypot(window.noise_uT, distorted_uT)))
+    distorted_uT = DISTORTED * soft_iron_sd * horizontal_uT
+    asked = replace(_thinned(window), noise_uT=float(np.hypot(window.noise_uT, distorted_uT)))
     bias_sd_uT = hard_iron_sd_uT
     for _ in range(rounds):
         fix, explained = locate_and_explain(asked, floors, options=replace(options, bias_sd_uT=bias_sd_uT))
@@ -108,7 +115,7 @@ def way_of(window: Window, device_to_frame: Array, place: ExplainedPlace, covari
     assert place.heading_rad is not None
     d = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
     step = np.diff(d, axis=0)
-    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step, axis=1))])
+    path = _path_m(d)
     device_yaw = np.arctan2(device_to_frame[-1, 1, 0], device_to_frame[-1, 0, 0])
     bend = place.heading_drift_rad_per_m * (path - path[-1])
     heading = place.heading_rad - device_yaw + bend  # of the window's frame at each sample
@@ -126,6 +133,27 @@ def with_sensor(window: Window, device_to_frame: Array, fit: CalibrationFit) -> 
     """The window as a calibrated sensor would have told it."""
     body = np.einsum("nji,nj->ni", device_to_frame, window.B_uT)
     return replace(window, B_uT=np.einsum("nij,nj->ni", device_to_frame, fit.model.apply(body)))
+
+
+def _thinned(window: Window) -> Window:
+    """The first and the last sample and one a metre between."""
+    path = _path_m(np.asarray(window.displacement_m, dtype=np.float64))
+    _, kept = np.unique(np.floor(path / SPACING_M), return_index=True)
+    kept = np.unique(np.append(kept, len(path) - 1))
+
+    def thin(each: Array | None) -> Array | None:
+        return None if each is None else each[kept]
+
+    return replace(
+        window, B_uT=window.B_uT[kept], displacement_m=window.displacement_m[kept], t_s=thin(window.t_s),
+        yaw_rad=thin(window.yaw_rad), device_to_frame=thin(window.device_to_frame),
+    )  # fmt: skip
+
+
+def _path_m(displacement_m: Array) -> Array:
+    """(n,) walked since the start, of displacements (n, 2 or 3), along the floor."""
+    step = np.linalg.norm(np.diff(displacement_m[:, :2], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(step)])
 
 
 def _device_to_frame(window: Window) -> Array:

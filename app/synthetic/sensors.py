@@ -128,7 +128,8 @@ def _measured_body_uT(
     zero = np.zeros_like(half)
     building_to_body = np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
     B = rotate_by_quaternion(building_to_body, building.field_uT(p))
-    return np.asarray(B @ np.array(sensor.distortion).T + sensor.hard_iron_uT + sensor.noise_uT * rng.normal(size=B.shape))
+    read = B @ np.array(sensor.distortion).T + sensor.hard_iron_uT
+    return np.asarray(read + sensor.noise_uT * rng.normal(size=B.shape))
 
 
 def _attitude_error_rad(t_s: Array, sensor: Magnetometer, rng: np.random.Generator) -> Array:
