@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from app.attitude.dip_angle import dip_angle, followed_up
-from app.attitude.disturbance import OutlierRule, critical_value, detection_power, follow_magnitude
+from app.attitude.disturbance import OutlierRule, critical_value, detection_power
 from app.attitude.field_belief import FieldFilter, InitialSpread, initial_belief
 from app.attitude.field_log import FieldLog, filter_log
+from app.attitude.magnitude_log import follow_magnitude
 from app.attitude.spherical_field import (
     cartesian_jacobian,
     from_spherical,

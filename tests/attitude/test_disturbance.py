@@ -13,10 +13,10 @@ from app.attitude.disturbance import (
     adapted_variance,
     critical_value,
     detection_power,
-    follow_magnitude,
     innovation_statistic,
     watch,
 )
+from app.attitude.magnitude_log import follow_magnitude
 from app.errors import InvalidInput
 
 DEFAULT = OutlierRule()

@@ -6,10 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from app.attitude.disturbance import MagnitudeState, critical_value, follow_magnitude
+from app.attitude.disturbance import MagnitudeState, critical_value
 from app.attitude.field_belief import FIELD, GRAVITY_M_S2, FieldFilter, InitialSpread, initial_belief
 from app.attitude.field_filter import canonical, predict_field, update_field, update_gravity
 from app.attitude.field_log import filter_log
+from app.attitude.magnitude_log import follow_magnitude
 from app.attitude.spherical_field import from_spherical, to_spherical
 from app.errors import InvalidInput
 
