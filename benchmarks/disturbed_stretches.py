@@ -201,6 +201,7 @@ def power(name: str, walks: list[Tried], mapped: bool, seed: int = 7) -> dict[st
     print(f"{name}, {'with' if mapped else 'without'} a map: found (of its time marked), by size in uT")
     print("            " + "".join(f"{size:>14.0f}" for size in SIZES_UT))
     out: dict[str, list[float]] = {}
+    alone = {id(w): {(each.start_s, each.end_s) for each in judge(w, mapped)} for w in walks}
     for kind, make in KINDS.items():
         usable = [w for w in walks if np.ptp(w.samples.t_s) > 30.0 and (kind != "at rest" or w.rest_s is not None)]
         if not usable:
@@ -211,8 +212,7 @@ def power(name: str, walks: list[Tried], mapped: bool, seed: int = 7) -> dict[st
             found, marked = [], []
             for tried in usable:
                 added = make(tried, rng, size)
-                before = {(each.start_s, each.end_s) for each in judge(tried, mapped)}
-                new = tuple(s for s in judge(tried, mapped, added) if (s.start_s, s.end_s) not in before)
+                new = tuple(s for s in judge(tried, mapped, added) if (s.start_s, s.end_s) not in alone[id(tried)])
                 hits = [s for s in new if s.start_s <= added.end_s + 0.5 and s.end_s >= added.start_s - 0.5]
                 inside = (tried.samples.t_s >= added.start_s) & (tried.samples.t_s <= added.end_s)
                 found.append(bool(hits))

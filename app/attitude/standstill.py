@@ -14,6 +14,8 @@ STILL_M_S = 0.15
 SHORTEST_S = 2.0
 BLOCK_S = 0.5
 HAND_M = 0.1
+SHARE_OF_WANDER = 0.5
+"""Who stands still does not swing the device: its attitude wanders less than along a walk."""
 REST_CHANCE = 1e-2
 TAIL_FREEDOM = 25.0
 GRADIENT_OVER_M = 0.5
@@ -62,7 +64,7 @@ def find_changes_at_rest(
         place = np.stack([p_building_m[s : s + block].mean(axis=0) for s in starts])
         off = np.linalg.norm(mean - np.median(mean, axis=0), axis=1)
         moved = np.linalg.norm(place - np.median(place, axis=0), axis=1) + HAND_M
-        turned = attitude_sd_rad * float(np.linalg.norm(np.median(mean, axis=0)))
+        turned = SHARE_OF_WANDER * attitude_sd_rad * float(np.linalg.norm(np.median(mean, axis=0)))
         variance = noise_sd_uT**2 / block + (gradient_uT_per_m * moved) ** 2 / 3.0 + turned**2
         c = B_uT.shape[1]
         p_value = f.sf(np.square(off) / (c * variance), c, TAIL_FREEDOM) * max((t_s[-1] - t_s[0]) / BLOCK_S, 1.0)
