@@ -1,5 +1,6 @@
 """Calibrations of a device's magnetometer: make one, list them, compare them. A calibration never changes."""
 
+import asyncio
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
@@ -114,13 +115,16 @@ async def create_calibration(
     surveys they were applied to. Refused with advice where the readings do not determine it."""
 
     def create(session: Session) -> tuple[int, BaseModel]:
-        fit, reference, readings = calibrate(session, context.grids, identity.organisation_id, body.asked())
         row = record_calibration(
             session, context.blobs, identity.organisation_id, device=body.device, fit=fit, reference=reference,
             readings=readings, measured_at=body.measured_at or datetime.now(UTC),
         )  # fmt: skip
         return 201, show_calibration(row)
 
+    # A search of its own, so in turn with those for positions, and before the transaction that keeps it.
+    fit, reference, readings = await asyncio.get_running_loop().run_in_executor(
+        context.searches, calibrate, context.sessions, context.grids, identity.organisation_id, body.asked()
+    )
     return await run_in_threadpool(partial(answer_once, context, identity, request, key, raw, create))
 
 

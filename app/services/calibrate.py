@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, sessionmaker
 
 from app.calibration.ellipsoid import ellipsoid
 from app.calibration.fit import CalibrationFit
@@ -80,15 +80,15 @@ class Asked:
 
 
 def calibrate(
-    session: Session, grids: GridCache, organisation_id: str, asked: Asked
+    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: Asked
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
     """The fit, the reference as JSON, and the arrays it was made from.
 
     Raises InvalidInput with advice where the readings do not determine it, NotFound, Conflict (no map yet).
     """
     if asked.walk is not None:
-        return _on_a_map(session, grids, organisation_id, asked, asked.walk)
-    earth = None if asked.place is None else _earth(session, organisation_id, asked.place)
+        return _on_a_map(sessions, grids, organisation_id, asked, asked.walk)
+    earth = None if asked.place is None else _earth(sessions, organisation_id, asked.place)
     readings = {"b_ut": asked.B_uT}
     told: dict[str, Any] = {} if earth is None else {"model": earth.model, "date": earth.on.isoformat()}
     if asked.method in CIRCLE_METHODS:
@@ -109,12 +109,13 @@ def calibrate(
     return _SPHERES[asked.method](asked.B_uT, magnitude), told | {"magnitude_ut": magnitude}, readings
 
 
-def _earth(session: Session, organisation_id: str, place: Place) -> EarthField:
+def _earth(sessions: sessionmaker[Session], organisation_id: str, place: Place) -> EarthField:
     if place.building_id is None:
         assert place.latitude_deg is not None
         assert place.longitude_deg is not None
         return earth_field(place.latitude_deg, place.longitude_deg, place.height_m, place.on)
-    building = session.get(Building, place.building_id)
+    with sessions() as session:
+        building = session.get(Building, place.building_id)
     if building is None or building.organisation_id != organisation_id:
         raise NotFound(f"no building {place.building_id}")
     if building.anchor is None:
@@ -125,15 +126,17 @@ def _earth(session: Session, organisation_id: str, place: Place) -> EarthField:
 
 
 def _on_a_map(
-    session: Session, grids: GridCache, organisation_id: str, asked: Asked, walk: MappedWalk
+    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: Asked, walk: MappedWalk
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
     _check_unit(walk.q)
-    maps = active_maps(
-        session.connection(), organisation_id, building_id=walk.building_id,
-        floor_ids=None if walk.floor_id is None else [walk.floor_id],
-    )  # fmt: skip
+    with sessions() as session:
+        maps = active_maps(
+            session.connection(), organisation_id, building_id=walk.building_id,
+            floor_ids=None if walk.floor_id is None else [walk.floor_id],
+        )  # fmt: skip
     if not maps:
-        raise Conflict(f"floor {walk.floor_id} has no map yet; upload surveys and wait for its job")
+        where = f"building {walk.building_id}" if walk.floor_id is None else f"floor {walk.floor_id}"
+        raise Conflict(f"{where} has no map yet; upload surveys and wait for its job")
     readings = {"b_ut": asked.B_uT, "orientation": walk.q, "way_m": walk.way_m}
     rotation = Rotation.from_quat(walk.q, scalar_first=True).as_matrix()
     if walk.known:

@@ -5,10 +5,12 @@ the phone; the map along that way then tells what the sensor makes of the field,
 found better. Two or three rounds settle it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.calibration.fit import CalibrationFit
 from app.calibration.map_aided import map_aided
@@ -75,9 +77,11 @@ def calibrate_on_map(
     axes; it is only good if `fix.status` is "fix". Raises InvalidInput where the walk is mostly off the map.
     """
     options = options or LocateOptions()
+    if options.walkable is None:  # off the map a walk is explained well by any sensor, and tells nothing of it
+        options = replace(options, walkable=partial(_mapped, {floor.floor_id: floor.grid for floor in floors}))
     turn = _device_to_frame(window)
-    horizontal_uT = float(np.median([np.hypot(*floor.grid.ambient_uT[:2]) for floor in floors]))
-    distorted_uT = DISTORTED * soft_iron_sd * horizontal_uT
+    window = replace(window, yaw_rad=_device_yaw_rad(turn))  # so that the heading found is the device's
+    distorted_uT = DISTORTED * soft_iron_sd * _turning_uT(turn, floors)
     asked = replace(_thinned(window), noise_uT=float(np.hypot(window.noise_uT, distorted_uT)))
     bias_sd_uT = hard_iron_sd_uT
     for _ in range(rounds):
@@ -90,6 +94,25 @@ def calibrate_on_map(
         fit = calibrate_along(window, turn, way, floor.grid, hard_iron_sd_uT=hard_iron_sd_uT, soft_iron_sd=soft_iron_sd)
         asked, bias_sd_uT = with_sensor(window, turn, fit), LEFT_UT
     return CalibratedOnMap(fit, asked, way, place.floor_id, fix)
+
+
+def _device_yaw_rad(device_to_frame: Array) -> Array:
+    """(n,) of the device's x axis in the window's frame."""
+    return np.asarray(np.arctan2(device_to_frame[:, 1, 0], device_to_frame[:, 0, 0]))
+
+
+def _mapped(grids: Mapping[str, FieldGrid], floor_id: str, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
+    """(ny, nx) which places of a floor are mapped."""
+    x, y = np.meshgrid(x_m, y_m)
+    return grids[floor_id].at(np.column_stack([x.ravel(), y.ravel()])).measured.reshape(x.shape)
+
+
+def _turning_uT(device_to_frame: Array, floors: Sequence[SearchableFloor]) -> float:
+    """By how much the ambient field moves in the device's axes as it is turned: that much of it a distortion spoils."""
+    ambient_uT = np.median([floor.grid.ambient_uT for floor in floors], axis=0)
+    level_uT = np.array([np.hypot(ambient_uT[0], ambient_uT[1]), 0.0, ambient_uT[2]])
+    body_uT = np.einsum("nji,j->ni", device_to_frame, level_uT)
+    return float(np.sqrt(np.sum(np.var(body_uT, axis=0))))
 
 
 def calibrate_along(
@@ -116,7 +139,7 @@ def way_of(window: Window, device_to_frame: Array, place: ExplainedPlace, covari
     d = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
     step = np.diff(d, axis=0)
     path = _path_m(d)
-    device_yaw = np.arctan2(device_to_frame[-1, 1, 0], device_to_frame[-1, 0, 0])
+    device_yaw = _device_yaw_rad(device_to_frame)[-1]
     bend = place.heading_drift_rad_per_m * (path - path[-1])
     heading = place.heading_rad - device_yaw + bend  # of the window's frame at each sample
     middle = 0.5 * (heading[1:] + heading[:-1])

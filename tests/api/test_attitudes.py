@@ -22,8 +22,8 @@ def carried(true_field_uT: Callable[..., np.ndarray]) -> tuple[dict[str, Any], n
     angles = np.column_stack([0.3 * t + 0.4 * np.sin(0.5 * t), 0.2 * np.sin(0.7 * t), 0.3 * np.sin(0.4 * t + 1.0)])
     truth = Rotation.from_euler("ZYX", angles)
     turned = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
-    gyro = np.vstack([turned[:1], turned]) + [0.004, -0.003, 0.002] + rng.normal(0, 0.003, (len(t), 3))
-    acceleration = np.gradient(np.gradient(p, t, axis=0), t, axis=0) + [0.0, 0.0, G]
+    gyro = np.vstack([turned[:1], turned]) + np.array([0.004, -0.003, 0.002]) + rng.normal(0, 0.003, (len(t), 3))
+    acceleration = np.gradient(np.gradient(p, t, axis=0), t, axis=0) + np.array([0.0, 0.0, G])
     force = truth.inv().apply(acceleration) + rng.normal(0, 0.1, (len(t), 3))
     B = truth.inv().apply(true_field_uT(x, y)) + rng.normal(0, 0.3, (len(t), 3))
     columns: dict[str, Any] = {
@@ -117,7 +117,7 @@ def test_a_hard_iron_is_taken_out_by_the_devices_calibration(service: Any, ancho
         "b_ut": sphere.tolist()})  # fmt: skip
     assert made.status_code == 201, made.text
     raw = columns | {
-        "magnetometer_ut": [None if row is None else (np.array(row) + hard_iron).tolist()
+        "magnetometer_ut": [None if row is None else np.add(row, hard_iron).tolist()
                             for row in columns["magnetometer_ut"]]
     }  # fmt: skip
     reference = {"kind": "map", "floor_id": anchored_floor, "position_m": p.tolist(), "position_sd_m": 0.1}
@@ -130,7 +130,7 @@ def test_a_magnet_held_near_is_told_and_not_believed(service: Any, anchored_floo
     columns, p, truth = carried
     from_s, to_s = 30.0, 38.0
     rows = [
-        row if row is None or not from_s <= t <= to_s else (np.array(row) + [40.0, 30.0, -20.0]).tolist()
+        row if row is None or not from_s <= t <= to_s else np.add(row, [40.0, 30.0, -20.0]).tolist()
         for t, row in zip(columns["t_s"], columns["magnetometer_ut"], strict=True)
     ]
     reference = {"kind": "map", "floor_id": anchored_floor, "position_m": p.tolist(), "position_sd_m": 0.1}
