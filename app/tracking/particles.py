@@ -90,15 +90,20 @@ def new_particles(
 
 
 def advance(
-    particles: Particles, move: Advance, places: Places, barriers: Barriers, noise: NDArray[np.float32]
-) -> Particles:
-    """Move particles and weigh them by the reading; noise (n, DRAWS) standard normal numbers."""
+    particles: Particles, move: Advance, places: Places, barriers: Barriers, noise: NDArray[np.float32],
+    innovation: Array | None = None,
+) -> Particles:  # fmt: skip
+    """Move particles and weigh them by the reading; noise (n, DRAWS) standard normal numbers.
+
+    innovation (n, 2), if given, is filled with the squares of each particle's innovation and their variance.
+    """
     rows, log_weight = particles.rows.copy(), particles.log_weight.copy()
     features = np.zeros(0) if move.features_uT is None else move.features_uT
+    told = np.zeros((0, 2)) if innovation is None else innovation
     _advance(
         rows, particles.floor, log_weight, move.moved_m, move.distance_m, move.risen_m, features, move.noise_uT2,
         np.ascontiguousarray(move.turn), move.walk, move.turns, move.strays, noise, places.cells, places.planes,
-        places.shapes, places.floors, places.resolution_m, places.errors, len(places.scale), barriers,
+        places.shapes, places.floors, places.resolution_m, places.errors, len(places.scale), barriers, told,
     )  # fmt: skip
     return Particles(rows, particles.floor, log_weight)
 
@@ -106,7 +111,7 @@ def advance(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _advance(  # type: ignore[no-untyped-def]
     rows, floor, log_weight, moved, distance, risen, features, noise_uT2, turn, walk, turns, strays, noise, cells,
-    planes, shapes, floors, resolution, errors, c, barriers,
+    planes, shapes, floors, resolution, errors, c, barriers, told,
 ):  # fmt: skip
     n = len(rows)
     observed = len(features) > 0
@@ -169,6 +174,8 @@ def _advance(  # type: ignore[no-untyped-def]
             row[_F + k] = f_k + gain_f * y_k
             squares += y_k * y_k
         log_weight[i] -= 0.5 * (squares / total + c * np.log(6.283185307179586 * total))
+        if len(told) > 0:
+            told[i, 0], told[i, 1] = squares, total
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")

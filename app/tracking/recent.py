@@ -1,6 +1,6 @@
 """The last metres of a track: readings far enough apart to tell something new, as a window for the global search."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ class Reading:
     displacement_m   (3,) where they were taken, on average
     yaw_rad, device_to_frame   of the device at the last of them
     unseen_m         that a device which does not know how it moves may have walked since the reading before
+    disturbed        it was found to be of no place: it is not searched for
     """
 
     number: int
@@ -30,6 +31,7 @@ class Reading:
     yaw_rad: float
     device_to_frame: Array | None
     unseen_m: float = 0.0
+    disturbed: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +49,17 @@ class Recent:
         """And one more; what is farther behind than `keep_m` is forgotten."""
         first = int(np.searchsorted(self.path_m, path_m - keep_m)) if self.path_m else 0
         return Recent((*self.readings[first:], reading), (*self.path_m[first:], path_m))
+
+    def with_last_disturbed(self) -> "Recent":
+        """The last reading marked."""
+        return Recent((*self.readings[:-1], replace(self.readings[-1], disturbed=True)), self.path_m)
+
+    def undisturbed(self) -> "Recent":
+        """Without the readings that were disturbed."""
+        if not any(reading.disturbed for reading in self.readings):
+            return self
+        kept = [k for k, reading in enumerate(self.readings) if not reading.disturbed]
+        return Recent(tuple(self.readings[k] for k in kept), tuple(self.path_m[k] for k in kept))
 
     def window(
         self, frame: WindowFrame, noise_uT: float, heading_rad: float | None, heading_sd_rad: float | None

@@ -39,8 +39,9 @@ def search(tracker: Tracker, state: TrackState, rng: np.random.Generator) -> Tra
 def _found(tracker: Tracker, state: TrackState, rng: np.random.Generator) -> Found:
     options, step = tracker.options, state.step
     assert step is not None
-    window = state.recent.window(tracker.frame, options.noise_uT, step.heading_rad, step.heading_sd_rad)
-    moves = window_moves(state.recent.readings, tracker.frame, tracker.places, options)
+    recent = state.recent.undisturbed()
+    window = recent.window(tracker.frame, options.noise_uT, step.heading_rad, step.heading_sd_rad)
+    moves = window_moves(recent.readings, tracker.frame, tracker.places, options)
     return find(moves, window, tracker.floors, tracker.places, tracker.barriers, options, None, options.particles, rng)
 
 
@@ -49,9 +50,10 @@ def _taken(tracker: Tracker, state: TrackState, found: Found, rng: np.random.Gen
     weight = weights(found.particles)
     count = enough(found.particles, weight, tracker.options)
     particles, chosen = resample(found.particles, weight, count, float(rng.uniform()))
+    recent = state.recent.undisturbed()
     nodes = tuple(
         Node(reading.number, reading.t_s, path_m)
-        for reading, path_m in zip(state.recent.readings, state.recent.path_m, strict=True)
+        for reading, path_m in zip(recent.readings, recent.path_m, strict=True)
     )
     lag = along(nodes, found.history_m[:, chosen], particles)
     estimate = tracker.describe(found.particles, weight)

@@ -14,11 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.errors import Fault, InvalidInput
 from app.positioning.features import common_components
 from app.positioning.floors import SearchableFloor, reduce_floor, shared_noise_sd_uT
 from app.positioning.window import WindowFrame
+from app.tracking.disturbance import LONGEST_M, is_disturbed, softened
 from app.tracking.estimate import Estimate, carried_on
 from app.tracking.gather import gathered, moved_on
 from app.tracking.ground import barriers_of
@@ -110,14 +112,13 @@ def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
     recent = recent.with_reading(reading, state.path_m, tracker.options.window_m)
     state = replace(state, step=step, recent=recent)
     move = move_between(before, reading, tracker.frame, tracker.places, tracker.options)
-    state = _predict_nothing(tracker, state, move)
     if state.particles is None:
         settled: tuple[Smoothed, ...] = ()
         if before is None and (tracker.prior is not None or step.displacement_m is None):
             state = _start_around(tracker, state, step, rng)
             state, settled = _weigh(tracker, state, move, before, reading, rng)
         else:
-            state = search(tracker, state, rng)
+            state = search(tracker, _predict_nothing(tracker, state, move), rng)
     else:
         state, settled = _weigh(tracker, state, move, before, reading, rng)
         if doubtful(tracker, state):
@@ -169,13 +170,15 @@ def _weigh(
     assert state.lag is not None
     options = tracker.options
     noise = rng.standard_normal((len(state.particles), DRAWS), dtype=np.float32)
-    particles = advance(state.particles, move, tracker.places, tracker.barriers, noise)
+    particles, move, state = _advanced(tracker, state, state.particles, move, noise)
+    state = _predict_nothing(tracker, state, move)
+    assert state.lag is not None
     weight, gained, _ = normalise(particles.log_weight)
     particles = replace(particles, log_weight=particles.log_weight - gained)
     particles = _on_floors(tracker, state, particles, before, reading, move, rng)
     walked, lost = state.gains[-1]
-    if share_between_floors(particles, weight, tracker.places) > 0.5:
-        gained = -lost  # on stairs neither the map nor its absence tells anything
+    if state.disturbed_from_m is not None or share_between_floors(particles, weight, tracker.places) > 0.5:
+        gained = -lost  # on stairs, and beside a magnet, neither the map nor its absence tells anything
     gains = (*state.gains[:-1], (walked, lost + gained))
     log_odds = min(state.log_odds + lost + gained, MOST_ODDS)
     lag = remember(state.lag, Node(reading.number, reading.t_s, state.path_m), particles)
@@ -186,6 +189,22 @@ def _weigh(
         particles, chosen = resample(particles, weight, count, float(rng.uniform()))
         lag = inherit(lag, chosen)
     return replace(state, particles=particles, lag=lag, gains=gains, log_odds=log_odds, estimate=estimate), settled
+
+
+def _advanced(
+    tracker: Tracker, state: TrackState, particles: Particles, move: Advance, noise: NDArray[np.float32]
+) -> tuple[Particles, Advance, TrackState]:
+    """Particles at the reading, which counts for little if it is disturbed: the move then, and the state, say so."""
+    innovation, components = np.zeros((len(particles), 2)), len(tracker.places.scale)
+    moved = advance(particles, move, tracker.places, tracker.barriers, noise, innovation)
+    since_m = state.path_m if state.disturbed_from_m is None else state.disturbed_from_m
+    believed = state.state == "converged" and state.path_m - since_m <= LONGEST_M
+    if not believed or not is_disturbed(innovation, normalise(particles.log_weight).weight, components):
+        return moved, move, replace(state, disturbed_from_m=None)
+    move = softened(move, innovation, components)
+    moved = advance(particles, move, tracker.places, tracker.barriers, noise)
+    recent = state.recent.with_last_disturbed()
+    return moved, move, replace(state, recent=recent, disturbed_from_m=since_m, disturbed=state.disturbed + 1)
 
 
 def _on_floors(

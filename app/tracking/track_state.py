@@ -60,6 +60,7 @@ class TrackState:
     searched_m      path at the last search
     tells_height    whether the device ever said that it rose or sank
     estimate_from_m (3,) where the device reckoned to be when the estimate was made
+    disturbed_from_m, disturbed   path at which readings began to be disturbed, if the last one was; how many were
     """
 
     step: Step | None = None
@@ -82,6 +83,8 @@ class TrackState:
     estimate: Estimate | None = None
     estimate_from_m: Array | None = None
     converged_at_m: float | None = None
+    disturbed_from_m: float | None = None
+    disturbed: int = 0
 
     @property
     def probability(self) -> float:

@@ -1,0 +1,34 @@
+"""Readings that no place of the belief explains: something passed by, was switched on, or is held near.
+
+A converged track that is right meets such readings rarely and one that is wrong meets them for long. So they count for
+little, by the variance that makes the innovation one of one sigma (Brommer, L193, Eq. 17), and say nothing for or
+against the place, but only along LONGEST_M: then they count as all others, and the track may find that it is lost.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from app.geometry import Array
+from app.tracking.particles import Advance
+
+__all__ = ["LONGEST_M", "is_disturbed", "softened"]
+
+LONGEST_M = 8.0
+CHANCE = 1e-4
+"""Of an innovation beyond it, by the variance it should have."""
+PLAUSIBLE_SHARE = 0.05
+"""Of the belief, for which the reading is no surprise: with less it is disturbed."""
+
+
+def is_disturbed(innovation: Array, weight: Array, components: int) -> bool:
+    """innovation (n, 2): squares and variance of each particle's, of so many components; weight (n,) before it."""
+    limit = float(chdtri(components, CHANCE))
+    return float(weight[innovation[:, 0] <= limit * innovation[:, 1]].sum()) < PLAUSIBLE_SHARE
+
+
+def softened(move: Advance, innovation: Array, components: int) -> Advance:
+    """The same move with a reading of which the middle one of the innovations is one sigma."""
+    missing = float(np.median(innovation[:, 0] / components - innovation[:, 1]))
+    return replace(move, noise_uT2=move.noise_uT2 + max(missing, 0.0))
