@@ -1,7 +1,8 @@
 """What Brommer et al. (2020) report of disturbance detection, tried again: every figure beside its target.
 
 Simulation as theirs (Brommer, L141-148), with what they do not print drawn here: ten minutes at 50 Hz, a tumbling body,
-noise of Table I in the sensor's axes, counts for microtesla throughout. No accelerometer. Real: trials of the BROAD benchmark, one of them tapped, which disturbs no field.
+noise of Table I in the sensor's axes, counts for microtesla throughout. No accelerometer.
+Real: trials of the BROAD benchmark, one of them tapped, which disturbs no field.
 
     python benchmarks/brommer.py [--seeds 4] [--no-broad]        exits 1 where a required figure is missed
 """
