@@ -20,7 +20,8 @@ from app.geometry import Array
 
 __all__ = [
     "CHANCE", "MagnitudeEvent", "MagnitudeState", "OutlierRule", "Watched", "adapted_variance", "check_log",
-    "critical_value", "detection_power", "event_row", "gathered_events", "innovation_statistic", "watch", "watch_outlier",
+    "critical_value", "detection_power", "event_row", "gathered_events", "innovation_statistic", "watch",
+    "watch_outlier",
 ]  # fmt: skip
 
 CHANCE = 0.0026997960632601866
