@@ -30,9 +30,10 @@ class CalibrationFit:
     """A sensor's calibration, how well it is known, and what would make it better.
 
     parameters           the method's own, by name; what has a unit says so: hard_iron_x_ut, rho_rad
-    parameter_sd         their sds; absent where the readings say nothing of them
+    parameter_sd         their sds; a method that has no prior names only what the readings tell
     covariance           (p, p) of the parameters, in their order
-    residual_rms_uT      of |corrected| minus the reference field, without outliers; residual_max_uT likewise
+    residual_rms_uT      of |corrected| minus the reference field, without outliers; residual_max_uT likewise; on a map,
+                         per axis, of corrected minus map
     outliers             readings that were left out of account
     determined, undetermined    names of parameters; `undetermined` also of those the method holds fixed
     advice               what rotation is missing, or what else to do, in plain words

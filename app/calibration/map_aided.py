@@ -13,6 +13,7 @@ little.
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -141,22 +142,30 @@ def _regress(walk: _Walk, prior_mean: Array, prior_sd: Array, noise_uT: float) -
     return theta, covariance, weight
 
 
+@numba.njit(cache=True, nogil=True)
 def _whiten(columns: Array, variance: Array, white: Array, keep: Array) -> Array:
     """Innovations of columns (n, 3, k) over their sds, of an Ornstein-Uhlenbeck error and white noise, axis by axis.
 
     The error is the unit process u_i = keep_i u_(i-1) + ... times the sd of the map there. Gains are the same for all
-    columns.
+    columns. It is the inverse Cholesky factor of the whole covariance, in linear time.
     """
-    sd = np.sqrt(variance)
     out = np.empty_like(columns)
-    state, P = np.zeros(columns.shape[1:]), np.ones(3)
-    for i in range(len(columns)):
-        state, P = keep[i] * state, keep[i] ** 2 * P + 1.0 - keep[i] ** 2
-        S = sd[i] ** 2 * P + white[i]
-        innovation = columns[i] - sd[i][:, None] * state
-        out[i] = innovation / np.sqrt(S)[:, None]
-        gain = sd[i] * P / S
-        state, P = state + gain[:, None] * innovation, P - gain * sd[i] * P
+    n, axes, k = columns.shape
+    state = np.zeros(k)
+    for axis in range(axes):
+        state[:] = 0.0
+        P = 1.0
+        for i in range(n):
+            P = keep[i] ** 2 * P + 1.0 - keep[i] ** 2
+            sd = np.sqrt(variance[i, axis])
+            S = variance[i, axis] * P + white[i]
+            gain = sd * P / S
+            for c in range(k):
+                predicted = keep[i] * state[c]
+                innovation = columns[i, axis, c] - sd * predicted
+                out[i, axis, c] = innovation / np.sqrt(S)
+                state[c] = predicted + gain * innovation
+            P -= gain * sd * P
     return out
 
 

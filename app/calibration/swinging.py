@@ -8,7 +8,7 @@ far is worked out from the noise, and taken off. What swinging cannot see is dis
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from app.calibration.circle import Ellipse, circle_model, fit_ellipse, vertical_offset_uT
 from app.calibration.fit import CalibrationFit, conclude_circle
@@ -16,7 +16,7 @@ from app.geometry import Array
 
 __all__ = ["caruso", "swinging"]
 
-_GRID = np.linspace(-7.0, 7.0, 1401)
+_GRID = np.linspace(-4.0, 7.0, 441)
 
 
 class _Swing(NamedTuple):
@@ -102,8 +102,8 @@ def _excess(short_uT: Array, noise_uT: float) -> tuple[float, float]:
     """
     if noise_uT < 1e-9 * float(np.max(short_uT)):
         return -float(np.min(short_uT)), noise_uT**2
-    near = short_uT[short_uT < 10.0 * noise_uT] / noise_uT
-    below = np.exp(norm.logcdf(_GRID[:, None] + near).sum(axis=1))
+    near = short_uT[short_uT < 8.0 * noise_uT] / noise_uT
+    below = np.exp(log_ndtr(_GRID[:, None] + near).sum(axis=1))
     density, middle = np.diff(below), 0.5 * (_GRID[1:] + _GRID[:-1])
     mean = float(density @ middle)
     return mean * noise_uT, float(density @ (middle - mean) ** 2) * noise_uT**2

@@ -130,14 +130,14 @@ def test_covariances_are_true(rng):
         "swinging": np.array([5.5, -7.0, 1.08, 0.93, 0.0]),
     }
     squared = {"modified": [], "swinging": []}
-    for _ in range(150):
+    for _ in range(80):
         B = circle(A_diagonal, np.array([5.5, -7.0]), 800) + 0.2 * rng.normal(size=(800, 3))
         for name, fit in (("modified", modified_ellipsoid(B, H_UT, Z_UT)), ("swinging", swinging(B, H_UT, Z_UT))):
             error = np.array(list(fit.parameters.values())) - truth[name]
             squared[name].append(error @ np.linalg.solve(fit.covariance, error))
     for name, values in squared.items():
         k = len(truth[name])
-        low, high = chi2.ppf([5e-4, 1 - 5e-4], 150 * k) / 150
+        low, high = chi2.ppf([5e-4, 1 - 5e-4], 80 * k) / 80
         slack = {"modified": 1.0, "swinging": 1.6}[name]  # extremes: coarse, and not Gaussian
         assert low / slack < np.mean(values) < high * slack, (name, np.mean(values))
 

@@ -56,7 +56,7 @@ def test_whitening_is_that_of_the_whole_covariance(rng):
 
 @pytest.mark.parametrize("tilted", [0.0, 0.5])
 def test_covariance_is_true(rng, tilted):
-    runs, squared = 60, []
+    runs, squared = 40, []
     for _ in range(runs):
         theta = drawn(rng)
         *given, path = walked(rng, theta, tilted=tilted)

@@ -97,7 +97,7 @@ def test_both_agree_up_to_a_rotation(seed, hard_iron_uT, field_uT):
 @pytest.mark.parametrize("noise_uT", [0.1, 2.0])
 def test_covariances_are_true_and_estimates_unbiased(rng, sphere, noise_uT):
     """At 4 % noise too, where the plain least squares is off by many sds."""
-    runs, off, plain = 100, [], []
+    runs, off, plain = 70, [], []
     for _ in range(runs):
         B = sphere(rng, distortion(TABLE_3_1), TABLE_3_1[3:6], B_R, noise_uT, 600)
         found = two_step(B, B_R)
