@@ -33,7 +33,8 @@ class AttitudeOptions:
     iron again when the field does not fit.
 
     Gates are chi-square quantiles with three degrees of freedom (14.16: 3 sigma, Brommer L175). A sensor rejected
-    without pause for `recovery_s` is believed again: the attitude is set from it.
+    without pause for `recovery_s` is believed again: the attitude is set from it. Where the field's strength or dip is
+    wrong too, the fault is the field's: a known one is waited for, a learned one learned anew after `new_field_s`.
     """
 
     gyro_noise_rad_per_sqrt_s: float = 1.5e-4
@@ -69,6 +70,7 @@ class AttitudeOptions:
     rest_rate_rad_per_s: float = 5e-4
     rest_largest_bias_rad_per_s: float = 0.035
     recovery_s: float = 5.0
+    new_field_s: float = 30.0
 
 
 class Tuning(NamedTuple):
@@ -106,6 +108,7 @@ class Tuning(NamedTuple):
     rest_rate: float
     rest_bias: float
     recovery: float
+    new_field: float
 
 
 def tuning_of(options: AttitudeOptions) -> Tuning:
@@ -124,7 +127,7 @@ def tuning_of(options: AttitudeOptions) -> Tuning:
         o.field_walk_uT_per_sqrt_s, o.hard_iron_uT, o.hard_iron_walk_uT_per_sqrt_s, o.learn_hard_iron,
         o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s, o.rest_detection,
         o.rest_gyro_rad_per_s, o.rest_accelerometer_m_per_s2, o.rest_after_s, o.rest_rate_rad_per_s,
-        o.rest_largest_bias_rad_per_s, o.recovery_s,
+        o.rest_largest_bias_rad_per_s, o.recovery_s, o.new_field_s,
     )  # fmt: skip
 
 

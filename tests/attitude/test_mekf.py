@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from app.attitude import kernel
 from app.attitude.mekf import AttitudeRun, AttitudeState, begin, follow_attitude
 from app.attitude.options import AttitudeOptions, InertialSamples
 from app.attitude.reference import constant_reference, learned_reference, level_reference
@@ -126,7 +127,9 @@ def test_half_a_turn_of_error_is_recovered_from(tumble: Callable, translation: s
     half = Rotation.from_rotvec(np.pi * np.array(axis)) * Rotation.from_quat(
         state.q_body_to_building, scalar_first=True
     )
-    wrong = replace(state, q_body_to_building=half.as_quat(scalar_first=True))
+    kept = state.kept.copy()
+    kept[kernel.SUM_WEIGHT :] = 0.0  # what was summed in the frame that is now forgotten
+    wrong = replace(state, q_body_to_building=half.as_quat(scalar_first=True), kept=kept)
     _, run = follow_attitude(wrong, _cut(tumbled.samples, 500, 4000), reference, options)
     truth = Rotation.from_quat(tumbled.truth[500:], scalar_first=True)
     error = (Rotation.from_quat(run.q_body_to_building, scalar_first=True).inv() * truth).magnitude()
@@ -214,7 +217,7 @@ def test_missing_rows_cost_certainty_and_nothing_else(tumble: Callable) -> None:
     yaw = np.einsum("ni,nij,nj->n", up, run.covariance_rad2, up)
     assert np.isfinite(run.q_body_to_building).all()
     assert not run.magnetometer_used[1500:2500].any()
-    assert yaw[2499] > 2.0 * yaw[1499]
+    assert yaw[2499] > 1.3 * yaw[1499]
     assert _deg(tumbled.error_rad(run.q_body_to_building)[500:]) < 0.8
 
 
