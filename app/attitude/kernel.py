@@ -1,8 +1,8 @@
 """The multiplicative extended Kalman filter, sample by sample, compiled (Kuevor, B20; Brommer, 1.3-1.9).
 
 Errors, in blocks of three: attitude (body's axes), gyro bias, velocity, the field learned where no reference is given
-(building frame, as Brommer's W_m), hard iron. Without a reference yaw is a matter of convention: it is fixed at the
-start, the field is learned in the frame so chosen, and north is read from the field. Given the attitude from gyro and
+(building frame, as Brommer's W_m), hard iron. Until a reading sets north, yaw is a matter of convention: it is fixed, and told as
+unknown. Where the field is learned it stays so: the field is learned in the frame chosen, and north read from it. Given the attitude from gyro and
 gravity, field and hard iron are linear in the readings, so the filter needs no good first guess of either.
 
 A disturbance shows in the two directions in which it cannot be taken for an error of yaw. Its power there, beyond what
@@ -175,7 +175,7 @@ def _level(q, P, k, force, sd):  # type: ignore[no-untyped-def]
     yaw = 0.0
     for i in range(3):
         for j in range(3):
-            yaw += R[2, i] * P[i, j] * R[2, j]
+            yaw += R[2, i] * P[i, j] * R[2, j] * k[NORTH_SET]
     advance(q, turn[0], turn[1], turn[2])
     building_from_body(q, R)
     _forget(P, ANGLE)
@@ -241,12 +241,8 @@ def _set_yaw(q, x, P, k, z, m, variance):  # type: ignore[no-untyped-def]
             known += R[2, i] * S[i, j] * R[2, j]
     more = variance / (level * level)
     if known + more > UNKNOWN_YAW_RAD2:  # a field that is all but vertical tells nothing of yaw
-        for i in range(3):
-            for j in range(3):
-                T[i, j] = (1.0 if i == j else 0.0) - R[2, i] * R[2, j]
-                T[i, IRON + j] = 0.0
-        innovation_covariance(P, T, TP, S)
-        more = UNKNOWN_YAW_RAD2
+        k[NORTH_SET] = 0.0
+        return
     for i in range(3):
         for j in range(SIZE):
             P[i, j] = P[j, i] = TP[i, j]
@@ -469,7 +465,7 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
         for i in range(3):
             for j in range(3):
                 noise[i, j] *= more
-            noise[i, i] += slow * more
+            noise[i, i] += slow * more + k[DISTURBANCE]
         _measure(q, x, P, H, r, HP, S, noise, learned)
     else:
         disturbed = k[DISTURBANCE] > s.disturbed**2
@@ -555,9 +551,10 @@ def _write(n, q, x, P, k, learned, lead, out):  # type: ignore[no-untyped-def]
             J[i, FIELD + 1] = -R[2, i] * mx / level2
     JP, S = empty((3, SIZE)), empty((3, 3))
     innovation_covariance(P, J, JP, S)
+    unknown = UNKNOWN_YAW_RAD2 if k[NORTH_SET] < 1.0 else 0.0
     for i in range(3):
         out[2][n, i] = x[i]
         for j in range(3):
-            out[1][n, i, j] = S[i, j]
+            out[1][n, i, j] = S[i, j] + unknown * R[2, i] * R[2, j]
     for i in range(4):
         out[0][n, i] = shown[i]

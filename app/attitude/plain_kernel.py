@@ -145,7 +145,7 @@ class PlainFilter:
         axis = np.cross(up, UP)
         size = np.linalg.norm(axis)
         turn = axis / size * np.arctan2(size, up[2]) if size > 1e-12 else np.array([np.pi * (up[2] < 0), 0.0, 0.0])
-        yaw = float(self.R[2] @ self.P[TH, TH] @ self.R[2])
+        yaw = float(self.R[2] @ self.P[TH, TH] @ self.R[2]) * self.k[K.NORTH_SET]
         self.attitude = Rotation.from_rotvec(turn) * self.attitude
         self._set_block(TH, np.zeros(3), 0.0)
         self.k[K.SUM_WEIGHT :] = 0.0
@@ -259,12 +259,12 @@ class PlainFilter:
         along, across = np.array([m[0], m[1], 0.0]) / level, np.array([-m[1], m[0], 0.0]) / level
         T = np.eye(K.SIZE)
         T[TH, TH] = np.eye(3) - np.outer(R[2], R[2])
-        level_only = T.copy()
         T[TH, TH] += np.outer(R[2], R.T @ along) * m[2] / level
         T[TH, IR] = np.outer(R[2], R.T @ across) / level
         more = variance / level**2
         if R[2] @ (T @ self.P @ T.T)[TH, TH] @ R[2] + more > K.UNKNOWN_YAW_RAD2:
-            T, more = level_only, K.UNKNOWN_YAW_RAD2
+            self.k[K.NORTH_SET] = 0.0
+            return
         self.P = T @ self.P @ T.T
         self.P[TH, TH] += more * np.outer(R[2], R[2])
         self.k[K.SUM_WEIGHT :] = 0.0
@@ -277,7 +277,9 @@ class PlainFilter:
             R2 = shown.as_matrix()[2]
             shown = Rotation.from_rotvec(-np.arctan2(my, mx) * UP) * shown
             J[:, K.FIELD], J[:, K.FIELD + 1] = R2 * my / (mx * mx + my * my), -R2 * mx / (mx * mx + my * my)
-        return np.asarray(shown.as_quat(scalar_first=True)), J @ self.P @ J.T
+        up = shown.as_matrix()[2]
+        unknown = K.UNKNOWN_YAW_RAD2 * (self.k[K.NORTH_SET] < 1.0) * np.outer(up, up)
+        return np.asarray(shown.as_quat(scalar_first=True)), J @ self.P @ J.T + unknown
 
 
 def _smooth(k: Array, start: int, new: Array, fade: float) -> None:
