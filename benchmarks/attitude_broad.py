@@ -144,7 +144,9 @@ def main() -> int:
         print(f"\n{path.stem}\n  {'':18s}  total  heading  inclination  as is  total / VQF")
         for name, row in rows.items():
             beside = rows["VQF, whole log" if "whole" in name else "VQF"][0]
-            print(f"  {name:18s} {row[0]:6.2f}   {row[1]:6.2f}       {row[2]:6.2f} {row[3]:6.2f}   {row[0] / beside:6.2f}")
+            print(
+                f"  {name:18s} {row[0]:6.2f}   {row[1]:6.2f}       {row[2]:6.2f} {row[3]:6.2f}   {row[0] / beside:6.2f}"
+            )
     return summarise(totals)
 
 
@@ -155,7 +157,9 @@ def summarise(totals: dict[str, dict[str, tuple[float, ...]]]) -> int:
         if rows:
             print(f"\nmean of {len(rows)} {kind} trials: total / as is")
             for name in rows[0]:
-                print(f"  {name:18s} {np.mean([r[name][0] for r in rows]):6.2f} {np.mean([r[name][3] for r in rows]):6.2f}")
+                print(
+                    f"  {name:18s} {np.mean([r[name][0] for r in rows]):6.2f} {np.mean([r[name][3] for r in rows]):6.2f}"
+                )
     missed = [
         name
         for name, row in totals.items()

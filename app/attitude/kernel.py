@@ -455,7 +455,8 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
             S[i, j] += noise[i, j]
     _disturbance(x, k, R, z, m, S, dt, s)
     size2 = m[0] ** 2 + m[1] ** 2 + m[2] ** 2
-    slow = s.field**2 + k[DISTURBANCE]
+    disturbance = k[DISTURBANCE] if s.weigh_disturbances else 0.0
+    slow = s.field**2 + disturbance
     for i in range(3):
         S[i, i] += s.reading**2 + s.field**2 + s.delay**2 * rate2 * size2
     believed = squared_distance(S, r) < s.magnetometer_gate
@@ -465,7 +466,7 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
         for i in range(3):
             for j in range(3):
                 noise[i, j] *= more
-            noise[i, i] += slow * more + k[DISTURBANCE]
+            noise[i, i] += slow * more + disturbance
         _measure(q, x, P, H, r, HP, S, noise, learned)
     else:
         disturbed = k[DISTURBANCE] > s.disturbed**2

@@ -181,7 +181,7 @@ class PlainFilter:
         from_map = R.T @ V @ R
         S = H @ self.P @ H.T + from_map
         self._disturbance(R @ (z - self.x[IR]), m, R @ S @ R.T, dt)
-        slow = s.field**2 + k[K.DISTURBANCE]
+        slow = s.field**2 + k[K.DISTURBANCE] * s.weigh_disturbances
         rate = k[K.LAST_GYRO : K.LAST_GYRO + 3] - self.x[BI]
         white = s.reading**2 + s.delay**2 * float(rate @ rate) * float(m @ m)
         r = z - R.T @ m - self.x[IR]
