@@ -157,9 +157,8 @@ def summarise(totals: dict[str, dict[str, tuple[float, ...]]]) -> int:
         if rows:
             print(f"\nmean of {len(rows)} {kind} trials: total / as is")
             for name in rows[0]:
-                print(
-                    f"  {name:18s} {np.mean([r[name][0] for r in rows]):6.2f} {np.mean([r[name][3] for r in rows]):6.2f}"
-                )
+                total, as_is = (np.mean([row[name][column] for row in rows]) for column in (0, 3))
+                print(f"  {name:18s} {total:6.2f} {as_is:6.2f}")
     missed = [
         name
         for name, row in totals.items()

@@ -2,9 +2,9 @@
 
 Analytic rooms like his, five flight profiles, a map of one survey of about 250 readings (Kuevor, L1205), the same
 samples through the same filter with only the reference changed (Kuevor, L1332). "As the source": every accelerometer
-reading is gravity, constant sigmas, no gates, the map's variance not used. "Ours": the velocity is known to stay small,
-gates, disturbances weighed, and the map's variance and that of a position known to 0.1 m. RMSE of roll, pitch and yaw in
-degrees after ten seconds, mean over rooms.
+reading is gravity, constant sigmas, no gates, the map's variance not used. "Ours": the velocity is known to stay
+small, gates, disturbances weighed, and the map's variance and that of a position known to 0.1 m. RMSE of roll, pitch
+and yaw in degrees after ten seconds, mean over rooms.
 
     python benchmarks/kuevor_attitude.py [room ...]     exits 1 where the map does not halve all three against one point
 """

@@ -1,8 +1,8 @@
 """The multiplicative extended Kalman filter, sample by sample, compiled (Kuevor, B20; Brommer, 1.3-1.9).
 
 Errors, in blocks of three: attitude (body's axes), gyro bias, velocity, the field learned where no reference is given
-(building frame, as Brommer's W_m), hard iron. Until a reading sets north, yaw is a matter of convention: it is fixed, and told as
-unknown. Where the field is learned it stays so: the field is learned in the frame chosen, and north read from it. Given the attitude from gyro and
+(building frame, as Brommer's W_m), hard iron. Until a reading sets north, yaw is a matter of convention: it is fixed, and told
+as unknown. Where the field is learned it stays so: it is learned in the frame chosen, and north read from it. Given the attitude from gyro and
 gravity, field and hard iron are linear in the readings, so the filter needs no good first guess of either.
 
 A disturbance shows in the two directions in which it cannot be taken for an error of yaw. Its power there, beyond what

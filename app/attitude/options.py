@@ -30,7 +30,8 @@ class AttitudeOptions:
 
     Magnetometer: white noise per sample; `field_uT` of field that changes over `field_correlation_s` as one moves;
     random walk of a learned field; hard iron at the start; a delay against the gyro. `learn_hard_iron`: open the hard
-    iron again when the field does not fit. `weigh_disturbances`: add what strength and dip show to be wrong to the noise.
+    iron again when the field does not fit. `weigh_disturbances`: add what strength and dip show to be wrong to the
+    noise.
 
     Gates are chi-square quantiles with three degrees of freedom (14.16: 3 sigma, Brommer L175). A sensor rejected
     without pause for `recovery_s` is believed again: the attitude is set from it. Where the field's strength or dip is
@@ -126,8 +127,8 @@ def tuning_of(options: AttitudeOptions) -> Tuning:
         o.unknown_rate_rad_per_s, o.translation == "bounded", o.speed_m_per_s, o.speed_correlation_s,
         o.accelerometer_noise_m_per_s_sqrt_s, o.accelerometer_m_per_s2, o.accelerometer_correlation_s,
         o.accelerometer_gate, o.gravity_m_per_s2, o.magnetometer_uT, o.field_uT, o.field_correlation_s,
-        o.field_walk_uT_per_sqrt_s, o.hard_iron_uT, o.hard_iron_walk_uT_per_sqrt_s, o.learn_hard_iron, o.weigh_disturbances,
-        o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s, o.rest_detection,
+        o.field_walk_uT_per_sqrt_s, o.hard_iron_uT, o.hard_iron_walk_uT_per_sqrt_s, o.learn_hard_iron,
+        o.weigh_disturbances, o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s, o.rest_detection,
         o.rest_gyro_rad_per_s, o.rest_accelerometer_m_per_s2, o.rest_after_s, o.rest_rate_rad_per_s,
         o.rest_largest_bias_rad_per_s, o.recovery_s, o.new_field_s,
     )  # fmt: skip

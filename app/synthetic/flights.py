@@ -52,7 +52,7 @@ def fly_profile(profile: Profile, *, seconds: float = 120.0, rate_hz: float = 20
 
 def _leaning(acceleration_m_per_s2: Array, heading_rad: Array) -> Array:
     """(n, 4) attitude whose z axis is along the thrust and whose x axis has the heading."""
-    thrust = acceleration_m_per_s2 + [0.0, 0.0, GRAVITY_M_PER_S2]
+    thrust = acceleration_m_per_s2 + np.array([0.0, 0.0, GRAVITY_M_PER_S2])
     z = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
     forward = np.stack([np.cos(heading_rad), np.sin(heading_rad), np.zeros_like(heading_rad)], axis=1)
     y = np.cross(z, forward)
