@@ -52,11 +52,13 @@ def euler_zyx_variance_rad2(q_body_to_building: Array, covariance_rad2: Array) -
     """
     R = Rotation.from_quat(q_body_to_building, scalar_first=True).as_matrix()
     up = R[:, 2]  # (-sin pitch, sin roll cos pitch, cos roll cos pitch)
-    level = np.maximum(np.hypot(up[:, 1], up[:, 2]), 1e-9)
+    level = np.hypot(up[:, 1], up[:, 2])
+    locked, level = level < 1e-6, np.maximum(level, 1e-6)
     zero = np.zeros(len(R))
     yaw = np.stack([zero, up[:, 1], up[:, 2]], axis=1) / level[:, None] ** 2
     pitch = np.stack([zero, up[:, 2], -up[:, 1]], axis=1) / level[:, None]
     roll = np.stack([np.ones(len(R)), zero, zero], axis=1) - up[:, :1] * yaw
-    return EulerVariances(
-        *(np.minimum(np.einsum("ni,nij,nj->n", g, covariance_rad2, g), LARGEST_RAD2) for g in (yaw, pitch, roll))
+    of_yaw, of_pitch, of_roll = (
+        np.minimum(np.einsum("ni,nij,nj->n", g, covariance_rad2, g), LARGEST_RAD2) for g in (yaw, pitch, roll)
     )
+    return EulerVariances(np.where(locked, LARGEST_RAD2, of_yaw), of_pitch, np.where(locked, LARGEST_RAD2, of_roll))

@@ -1,20 +1,26 @@
 """A measurement of three numbers into a joint covariance, compiled: gain, chi-square, and Joseph's form written out."""
 
 from numba import njit
-from numpy import empty
+from numpy import empty, sqrt
 
 __all__ = ["condition", "gain", "innovation_covariance", "inverse", "squared_distance"]
 
 
 @njit(cache=True, nogil=True)
 def inverse(S, out):  # type: ignore[no-untyped-def]
-    """The inverse of a symmetric positive (3, 3), into `out`."""
-    a, b, c, d, e, f = S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2]
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * A + b * B + c * C
-    out[0, 0], out[0, 1], out[0, 2] = A / det, B / det, C / det
-    out[1, 0], out[1, 1], out[1, 2] = B / det, (a * f - c * c) / det, (b * c - a * e) / det
-    out[2, 0], out[2, 1], out[2, 2] = C / det, (b * c - a * e) / det, (a * d - b * b) / det
+    """The inverse of a symmetric positive (3, 3), into `out`, by Cholesky: cofactors would square its condition."""
+    l00 = sqrt(S[0, 0])
+    l10, l20 = S[1, 0] / l00, S[2, 0] / l00
+    l11 = sqrt(S[1, 1] - l10 * l10)
+    l21 = (S[2, 1] - l20 * l10) / l11
+    l22 = sqrt(S[2, 2] - l20 * l20 - l21 * l21)
+    a, b, c = 1.0 / l00, 1.0 / l11, 1.0 / l22  # the lower triangle's inverse: [a], [d b], [f e c]
+    d, e = -l10 * a * b, -l21 * b * c
+    f = -(l20 * a + l21 * d) * c
+    out[0, 0], out[1, 1], out[2, 2] = a * a + d * d + f * f, b * b + e * e, c * c
+    out[0, 1] = out[1, 0] = d * b + f * e
+    out[0, 2] = out[2, 0] = f * c
+    out[1, 2] = out[2, 1] = e * c
 
 
 @njit(cache=True, nogil=True)

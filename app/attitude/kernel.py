@@ -1,8 +1,8 @@
 """The multiplicative extended Kalman filter, sample by sample, compiled (Kuevor, B20; Brommer, 1.3-1.9).
 
 Errors, in blocks of three: attitude (body's axes), gyro bias, velocity, the field learned where no reference is given
-(building frame, as Brommer's W_m), hard iron. Without a reference yaw is a matter of convention: it is fixed at the
-start, the field is learned in the frame so chosen, and north is read from the field. Given the attitude from gyro and
+(building frame, as Brommer's W_m), hard iron. Until a reading sets north, yaw is a matter of convention: it is fixed, and told
+as unknown. Where the field is learned it stays so: it is learned in the frame chosen, and north read from it. Given the attitude from gyro and
 gravity, field and hard iron are linear in the readings, so the filter needs no good first guess of either.
 
 A disturbance shows in the two directions in which it cannot be taken for an error of yaw. Its power there, beyond what
@@ -37,8 +37,8 @@ RESIDUAL_MEAN_S = 0.3
 REST_CORRELATION_S = 1.0
 NORTH_SET_S = 0.3
 REST_SPEED_M_S = 0.02
-RELEVELLED_RAD = 0.2
-BLAME_S, BLAME_SPREAD, BLAME_UT, BLAME_SHARE, LEAST_SPREAD, BLAMED_UT = 3.0, 0.2, 3.0, 0.7, 0.02, 1.5
+RELEVELLED_RAD, LOST_RAD2 = 0.2, 0.1
+BLAME_S, BLAME_SPREAD, BLAME_UT, BLAME_SHARE, LEAST_SPREAD, BLAMED_UT = 3.0, 0.2, 3.0, 0.7, 0.005, 1.5
 """Seconds looked back on, the rotation and scatter needed to judge, the share hard iron must explain of the scatter."""
 UNKNOWN_YAW_RAD2 = pi * pi / 3.0
 
@@ -110,7 +110,10 @@ def _predict(q, x, P, k, dt, rate, force, has_force, s):  # type: ignore[no-unty
     size2 = rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2
     wrong = s.gyro_scale**2 * size2 * dt
     if dt > s.gyro_gap:
-        wrong += (s.unknown_rate * (dt - s.gyro_gap)) ** 2
+        turned = (s.unknown_rate * (dt - s.gyro_gap)) ** 2
+        wrong += turned
+        if turned > LOST_RAD2:  # too wrong for small angles: the next readings set the attitude anew
+            k[FORCE_REJECTED_S], k[NORTH_SET] = -1.0, 0.0
     for i in range(3):
         P[i, i] += noise[0] + wrong
         P[i, BIAS + i] += noise[1]
@@ -153,7 +156,7 @@ def _measure(q, x, P, H, r, HP, S, noise, upright):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def _level(q, P, force, sd):  # type: ignore[no-untyped-def]
+def _level(q, P, k, force, sd):  # type: ignore[no-untyped-def]
     """Turn the attitude the short way until a specific force (3,), body's axes, points up; tilt known to sd, rad."""
     R, turn = empty((3, 3)), empty(3)
     building_from_body(q, R)
@@ -172,10 +175,11 @@ def _level(q, P, force, sd):  # type: ignore[no-untyped-def]
     yaw = 0.0
     for i in range(3):
         for j in range(3):
-            yaw += R[2, i] * P[i, j] * R[2, j]
+            yaw += R[2, i] * P[i, j] * R[2, j] * k[NORTH_SET]
     advance(q, turn[0], turn[1], turn[2])
     building_from_body(q, R)
     _forget(P, ANGLE)
+    k[SUM_WEIGHT:KEPT] = 0.0
     for i in range(3):
         for j in range(3):
             P[i, j] = sd * sd * (R[0, i] * R[0, j] + R[1, i] * R[1, j]) + yaw * R[2, i] * R[2, j]
@@ -207,8 +211,12 @@ def _learn_field(q, x, P, z, sd):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _set_yaw(q, x, P, z, m, variance):  # type: ignore[no-untyped-def]
-    """Turn the attitude about the vertical until a reading z (3,) has the azimuth of the field m (3,), uT."""
+def _set_yaw(q, x, P, k, z, m, variance):  # type: ignore[no-untyped-def]
+    """Turn the attitude about the vertical until a reading z (3,) has the azimuth of the field m (3,), uT.
+
+    The error of yaw is then that of tilt about the field's level direction, times the slope of the field, that of hard
+    iron across it, and the reading's; told as covariances, or later readings would be counted twice.
+    """
     R, b = empty((3, 3)), zeros(3)
     building_from_body(q, R)
     for i in range(3):
@@ -216,21 +224,32 @@ def _set_yaw(q, x, P, z, m, variance):  # type: ignore[no-untyped-def]
             b[i] += R[i, j] * (z[j] - x[IRON - BIAS + j])
     yaw = arctan2(m[1], m[0]) - arctan2(b[1], b[0])
     yaw = arctan2(sin(yaw), cos(yaw))
-    level2 = m[0] * m[0] + m[1] * m[1]
-    tilt = total = 0.0
-    for i in range(3):
-        total += P[i, i]
-        for j in range(3):
-            tilt -= R[2, i] * P[i, j] * R[2, j]
-    tilt = 0.5 * (total + tilt)
-    iron = (P[IRON, IRON] + P[IRON + 1, IRON + 1] + P[IRON + 2, IRON + 2]) / 3.0
-    known = min((variance + iron + tilt * m[2] * m[2]) / level2, UNKNOWN_YAW_RAD2)
     advance(q, R[2, 0] * yaw, R[2, 1] * yaw, R[2, 2] * yaw)
     building_from_body(q, R)
-    _forget(P, ANGLE)
+    level = max(sqrt(m[0] * m[0] + m[1] * m[1]), 1e-6)
+    T, TP, S = zeros((3, SIZE)), empty((3, SIZE)), empty((3, 3))
     for i in range(3):
         for j in range(3):
-            P[i, j] = tilt * (R[0, i] * R[0, j] + R[1, i] * R[1, j]) + known * R[2, i] * R[2, j]
+            along = (R[0, j] * m[0] + R[1, j] * m[1]) / level
+            across = (R[1, j] * m[0] - R[0, j] * m[1]) / level
+            T[i, j] = (1.0 if i == j else 0.0) - R[2, i] * R[2, j] + R[2, i] * along * m[2] / level
+            T[i, IRON + j] = R[2, i] * across / level
+    innovation_covariance(P, T, TP, S)
+    known = 0.0
+    for i in range(3):
+        for j in range(3):
+            known += R[2, i] * S[i, j] * R[2, j]
+    more = variance / (level * level)
+    if known + more > UNKNOWN_YAW_RAD2:  # a field that is all but vertical tells nothing of yaw
+        k[NORTH_SET] = 0.0
+        return
+    for i in range(3):
+        for j in range(SIZE):
+            P[i, j] = P[j, i] = TP[i, j]
+    for i in range(3):
+        for j in range(3):
+            P[i, j] = S[i, j] + more * R[2, i] * R[2, j]
+    k[SUM_WEIGHT:KEPT] = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -261,9 +280,22 @@ def _watch_rest(k, gyro, force, dt, s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _relevel(q, x, P, k, s):  # type: ignore[no-untyped-def]
+    """Believe the accelerometer again: what it read lately is gravity, and the velocity starts anew."""
+    k[FORCE_REJECTED_S] = 0.0
+    _level(q, P, k, k[MEAN_FORCE : MEAN_FORCE + 3], RELEVELLED_RAD)
+    _forget(P, VELOCITY)
+    for i in range(3):
+        x[3 + i], P[VELOCITY + i, VELOCITY + i] = 0.0, s.speed**2 if s.bounded else 0.0
+
+
+@njit(cache=True, nogil=True)
 def _accelerometer(q, x, P, k, f, dt, s):  # type: ignore[no-untyped-def]
     """Gravity, or a velocity that stays small; whether it was believed."""
     H, HP, S, noise, r = zeros((3, SIZE)), empty((3, SIZE)), empty((3, 3)), zeros((3, 3)), empty(3)
+    if k[FORCE_REJECTED_S] < 0.0:
+        _relevel(q, x, P, k, s)
+        return True
     if s.bounded:
         at_rest = s.rest and k[STILL_S] > s.rest_after
         sd, correlation = (REST_SPEED_M_S, REST_MEAN_S) if at_rest else (s.speed, s.speed_correlation)
@@ -288,11 +320,7 @@ def _accelerometer(q, x, P, k, f, dt, s):  # type: ignore[no-untyped-def]
     else:
         k[FORCE_REJECTED_S] += dt
         if k[FORCE_REJECTED_S] > s.recovery:
-            k[FORCE_REJECTED_S] = 0.0
-            _level(q, P, k[MEAN_FORCE : MEAN_FORCE + 3], RELEVELLED_RAD)
-            _forget(P, VELOCITY)
-            for i in range(3):
-                x[3 + i], P[VELOCITY + i, VELOCITY + i] = 0.0, s.speed**2 if s.bounded else 0.0
+            _relevel(q, x, P, k, s)
     return believed
 
 
@@ -392,7 +420,7 @@ def _set_north(q, x, P, k, R, z, m, variance, learned, dt, s):  # type: ignore[n
         _learn_field(q, x, P, mean, sqrt(s.reading**2 + s.field**2))
     elif k[NORTH_SET] == 1.0:
         typical = (variance[0, 0] + variance[1, 1] + variance[2, 2]) / 3.0
-        _set_yaw(q, x, P, mean, m, s.reading**2 + s.field**2 + typical)
+        _set_yaw(q, x, P, k, mean, m, s.reading**2 + s.field**2 + typical)
         for i in range(3):
             k[MEAN_RESIDUAL + i] = m[i]
 
@@ -427,9 +455,10 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
             S[i, j] += noise[i, j]
     _disturbance(x, k, R, z, m, S, dt, s)
     size2 = m[0] ** 2 + m[1] ** 2 + m[2] ** 2
-    slow = s.field**2 + k[DISTURBANCE]
+    disturbance = k[DISTURBANCE] if s.weigh_disturbances else 0.0
+    slow = s.field**2 + disturbance
     for i in range(3):
-        S[i, i] += s.reading**2 + slow + s.delay**2 * rate2 * size2
+        S[i, i] += s.reading**2 + s.field**2 + s.delay**2 * rate2 * size2
     believed = squared_distance(S, r) < s.magnetometer_gate
     if believed:
         k[MAG_REJECTED_S] = 0.0
@@ -437,10 +466,11 @@ def _magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s):  #
         for i in range(3):
             for j in range(3):
                 noise[i, j] *= more
-            noise[i, i] += slow * more
+            noise[i, i] += slow * more + disturbance
         _measure(q, x, P, H, r, HP, S, noise, learned)
     else:
-        k[MAG_REJECTED_S] += dt
+        disturbed = k[DISTURBANCE] > s.disturbed**2
+        k[MAG_REJECTED_S] += dt * ((s.recovery / s.new_field if learned else 0.0) if disturbed else 1.0)
         if k[MAG_REJECTED_S] > s.recovery:
             k[MAG_REJECTED_S], k[NORTH_SET] = 0.0, 0.0  # the next reading sets it anew
     return believed
@@ -522,9 +552,10 @@ def _write(n, q, x, P, k, learned, lead, out):  # type: ignore[no-untyped-def]
             J[i, FIELD + 1] = -R[2, i] * mx / level2
     JP, S = empty((3, SIZE)), empty((3, 3))
     innovation_covariance(P, J, JP, S)
+    unknown = UNKNOWN_YAW_RAD2 if k[NORTH_SET] < 1.0 else 0.0
     for i in range(3):
         out[2][n, i] = x[i]
         for j in range(3):
-            out[1][n, i, j] = S[i, j]
+            out[1][n, i, j] = S[i, j] + unknown * R[2, i] * R[2, j]
     for i in range(4):
         out[0][n, i] = shown[i]

@@ -58,8 +58,12 @@ class AttitudeState:
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of attitude error and gyro bias, as the source has it: rad, rad/s."""
-        return self.joint_covariance[:6, :6]
+        """(6, 6) of attitude error and gyro bias, as the source has it: rad, rad/s. Yaw unknown until north is set."""
+        P = self.joint_covariance[:6, :6].copy()
+        if self.kept[kernel.NORTH_SET] < 1.0:
+            up = Rotation.from_quat(self.q_body_to_building, scalar_first=True).as_matrix()[2]
+            P[:3, :3] += kernel.UNKNOWN_YAW_RAD2 * np.outer(up, up)
+        return P
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,10 +87,14 @@ def begin(
 ) -> AttitudeState:
     """The state before the first of these samples: levelled by their first accelerometer readings, yaw unknown.
 
-    Yaw is set by the first magnetometer reading that has a reference (with TRIAD's answer: gravity is believed first),
-    and has the variance of a guess until then. Raises InvalidInput where no accelerometer reading is finite.
+    `follow_attitude` sets yaw by the first third of a second of readings that have a reference, wherever in the stream
+    they come (TRIAD's answer: gravity is believed first), and tells it as unknown until then. A reference that is
+    checked here is refused before anything is followed. Raises InvalidInput where no accelerometer reading is finite.
     """
     options = options or AttitudeOptions()
+    tuning_of(options)
+    if reference is not None:
+        reference.rows(len(samples))
     finite = np.isfinite(samples.accelerometer_m_per_s2).all(axis=1)
     if not finite.any():
         message = "no accelerometer reading is finite: gravity is needed to begin"
@@ -100,11 +108,9 @@ def begin(
     off = abs(size / options.gravity_m_per_s2 - 1.0) + float(force.std(axis=0).max()) / options.gravity_m_per_s2
     tilt_rad = START_TILT_RAD if off < 0.05 else MOVING_TILT_RAD
     q = _levelled(mean / size)
-    learned = reference is not None and reference.B_uT is None
     R = Rotation.from_quat(q, scalar_first=True).as_matrix()
-    yaw_variance = 1e-8 if learned else kernel.UNKNOWN_YAW_RAD2
     P = np.zeros((kernel.SIZE, kernel.SIZE))
-    P[:3, :3] = R.T @ np.diag([tilt_rad**2, tilt_rad**2, yaw_variance]) @ R
+    P[:3, :3] = R.T @ np.diag([tilt_rad**2, tilt_rad**2, 0.0]) @ R
     sds = [options.gyro_bias_rad_per_s, options.speed_m_per_s if options.translation == "bounded" else 0.0, 0.0,
            options.hard_iron_uT]  # fmt: skip
     P[3:, 3:] = np.diag(np.square(np.repeat(sds, 3)))

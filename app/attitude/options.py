@@ -30,10 +30,12 @@ class AttitudeOptions:
 
     Magnetometer: white noise per sample; `field_uT` of field that changes over `field_correlation_s` as one moves;
     random walk of a learned field; hard iron at the start; a delay against the gyro. `learn_hard_iron`: open the hard
-    iron again when the field does not fit.
+    iron again when the field does not fit. `weigh_disturbances`: add what strength and dip show to be wrong to the
+    noise.
 
     Gates are chi-square quantiles with three degrees of freedom (14.16: 3 sigma, Brommer L175). A sensor rejected
-    without pause for `recovery_s` is believed again: the attitude is set from it.
+    without pause for `recovery_s` is believed again: the attitude is set from it. Where the field's strength or dip is
+    wrong too, the fault is the field's: a known one is waited for, a learned one learned anew after `new_field_s`.
     """
 
     gyro_noise_rad_per_sqrt_s: float = 1.5e-4
@@ -58,6 +60,7 @@ class AttitudeOptions:
     hard_iron_uT: float = 0.3
     hard_iron_walk_uT_per_sqrt_s: float = 0.01
     learn_hard_iron: bool = True
+    weigh_disturbances: bool = True
     magnetometer_delay_s: float = 0.005
     magnetometer_gate: float = 21.1
     disturbed_uT: float = 4.0
@@ -69,6 +72,7 @@ class AttitudeOptions:
     rest_rate_rad_per_s: float = 5e-4
     rest_largest_bias_rad_per_s: float = 0.035
     recovery_s: float = 5.0
+    new_field_s: float = 30.0
 
 
 class Tuning(NamedTuple):
@@ -95,6 +99,7 @@ class Tuning(NamedTuple):
     hard_iron: float
     hard_iron_walk: float
     learn_hard_iron: bool
+    weigh_disturbances: bool
     delay: float
     magnetometer_gate: float
     disturbed: float
@@ -106,6 +111,7 @@ class Tuning(NamedTuple):
     rest_rate: float
     rest_bias: float
     recovery: float
+    new_field: float
 
 
 def tuning_of(options: AttitudeOptions) -> Tuning:
@@ -122,9 +128,9 @@ def tuning_of(options: AttitudeOptions) -> Tuning:
         o.accelerometer_noise_m_per_s_sqrt_s, o.accelerometer_m_per_s2, o.accelerometer_correlation_s,
         o.accelerometer_gate, o.gravity_m_per_s2, o.magnetometer_uT, o.field_uT, o.field_correlation_s,
         o.field_walk_uT_per_sqrt_s, o.hard_iron_uT, o.hard_iron_walk_uT_per_sqrt_s, o.learn_hard_iron,
-        o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s, o.rest_detection,
+        o.weigh_disturbances, o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s, o.rest_detection,
         o.rest_gyro_rad_per_s, o.rest_accelerometer_m_per_s2, o.rest_after_s, o.rest_rate_rad_per_s,
-        o.rest_largest_bias_rad_per_s, o.recovery_s,
+        o.rest_largest_bias_rad_per_s, o.recovery_s, o.new_field_s,
     )  # fmt: skip
 
 

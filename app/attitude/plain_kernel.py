@@ -82,7 +82,10 @@ class PlainFilter:
             F[VE, TH] = -dt * R @ cross_matrix(force)
             self.x[VE] += dt * (R @ force - k[K.GRAVITY] * UP)
         self.attitude = self.attitude * half * half
-        wrong = s.gyro_scale**2 * (rate @ rate) * dt + (s.unknown_rate * max(0.0, dt - s.gyro_gap)) ** 2
+        turned = (s.unknown_rate * max(0.0, dt - s.gyro_gap)) ** 2
+        wrong = s.gyro_scale**2 * (rate @ rate) * dt + turned
+        if turned > K.LOST_RAD2:
+            k[K.FORCE_REJECTED_S], k[K.NORTH_SET] = -1.0, 0.0
         v, u, eye = s.gyro_noise**2, s.bias_walk**2, np.eye(3)
         Q = np.zeros((K.SIZE, K.SIZE))
         Q[TH, TH] = (v * dt + u * dt**3 / 3.0 + wrong) * eye
@@ -111,6 +114,9 @@ class PlainFilter:
 
     def _accelerometer(self, force: Array, dt: float) -> bool:
         s, k, H, eye = self.s, self.k, np.zeros((3, K.SIZE)), np.eye(3)
+        if k[K.FORCE_REJECTED_S] < 0.0:
+            self._relevel()
+            return True
         if s.bounded:
             still = s.rest and k[K.STILL_S] > s.rest_after
             sd, correlation = (K.REST_SPEED_M_S, K.REST_MEAN_S) if still else (s.speed, s.speed_correlation)
@@ -126,23 +132,24 @@ class PlainFilter:
             return True
         k[K.FORCE_REJECTED_S] += dt
         if k[K.FORCE_REJECTED_S] > s.recovery:
-            k[K.FORCE_REJECTED_S] = 0.0
-            self._level(k[K.MEAN_FORCE : K.MEAN_FORCE + 3])
-            self._set_block(VE, np.zeros(3), s.speed**2 if s.bounded else 0.0)
+            self._relevel()
         return False
+
+    def _relevel(self) -> None:
+        self.k[K.FORCE_REJECTED_S] = 0.0
+        self._level(self.k[K.MEAN_FORCE : K.MEAN_FORCE + 3])
+        self._set_block(VE, np.zeros(3), self.s.speed**2 if self.s.bounded else 0.0)
 
     def _level(self, force: Array) -> None:
         up = self.R @ force / np.linalg.norm(force)
         axis = np.cross(up, UP)
         size = np.linalg.norm(axis)
         turn = axis / size * np.arctan2(size, up[2]) if size > 1e-12 else np.array([np.pi * (up[2] < 0), 0.0, 0.0])
-        yaw = float(self.R[2] @ self.P[TH, TH] @ self.R[2])
+        yaw = float(self.R[2] @ self.P[TH, TH] @ self.R[2]) * self.k[K.NORTH_SET]
         self.attitude = Rotation.from_rotvec(turn) * self.attitude
-        self._known_as(K.RELEVELLED_RAD**2, yaw)
-
-    def _known_as(self, tilt: float, yaw: float) -> None:
         self._set_block(TH, np.zeros(3), 0.0)
-        self.P[TH, TH] = self.R.T @ np.diag([tilt, tilt, yaw]) @ self.R
+        self.k[K.SUM_WEIGHT :] = 0.0
+        self.P[TH, TH] = self.R.T @ np.diag([K.RELEVELLED_RAD**2, K.RELEVELLED_RAD**2, yaw]) @ self.R
 
     def _rest(self, gyro: Array, dt: float) -> None:
         s, k = self.s, self.k
@@ -174,12 +181,13 @@ class PlainFilter:
         from_map = R.T @ V @ R
         S = H @ self.P @ H.T + from_map
         self._disturbance(R @ (z - self.x[IR]), m, R @ S @ R.T, dt)
-        slow = s.field**2 + k[K.DISTURBANCE]
+        slow = s.field**2 + k[K.DISTURBANCE] * s.weigh_disturbances
         rate = k[K.LAST_GYRO : K.LAST_GYRO + 3] - self.x[BI]
         white = s.reading**2 + s.delay**2 * float(rate @ rate) * float(m @ m)
         r = z - R.T @ m - self.x[IR]
-        if r @ np.linalg.solve(S + (white + slow) * eye, r) >= s.magnetometer_gate:
-            k[K.MAG_REJECTED_S] += dt
+        if r @ np.linalg.solve(S + (white + s.field**2) * eye, r) >= s.magnetometer_gate:
+            patience = s.recovery / s.new_field if learned else 0.0
+            k[K.MAG_REJECTED_S] += dt * (patience if k[K.DISTURBANCE] > s.disturbed**2 else 1.0)
             if k[K.MAG_REJECTED_S] > s.recovery:
                 k[K.MAG_REJECTED_S] = k[K.NORTH_SET] = 0.0
             return False
@@ -244,12 +252,22 @@ class PlainFilter:
             k[K.MEAN_RESIDUAL : K.MEAN_RESIDUAL + 3] = reference
 
     def _set_yaw(self, reading: Array, m: Array, variance: float) -> None:
-        b, P = self.R @ reading, self.P
+        b = self.R @ reading
         yaw = np.arctan2(m[1], m[0]) - np.arctan2(b[1], b[0])
-        tilt = 0.5 * float(np.trace(P[TH, TH]) - self.R[2] @ P[TH, TH] @ self.R[2])
-        total = variance + float(np.trace(P[IR, IR])) / 3.0 + tilt * m[2] ** 2
-        self.attitude = Rotation.from_rotvec(yaw * UP) * self.attitude
-        self._known_as(tilt, min(total / float(m[0] ** 2 + m[1] ** 2), K.UNKNOWN_YAW_RAD2))
+        self.attitude = Rotation.from_rotvec(np.arctan2(np.sin(yaw), np.cos(yaw)) * UP) * self.attitude
+        R, level = self.R, max(float(np.hypot(m[0], m[1])), 1e-6)
+        along, across = np.array([m[0], m[1], 0.0]) / level, np.array([-m[1], m[0], 0.0]) / level
+        T = np.eye(K.SIZE)
+        T[TH, TH] = np.eye(3) - np.outer(R[2], R[2])
+        T[TH, TH] += np.outer(R[2], R.T @ along) * m[2] / level
+        T[TH, IR] = np.outer(R[2], R.T @ across) / level
+        more = variance / level**2
+        if R[2] @ (T @ self.P @ T.T)[TH, TH] @ R[2] + more > K.UNKNOWN_YAW_RAD2:
+            self.k[K.NORTH_SET] = 0.0
+            return
+        self.P = T @ self.P @ T.T
+        self.P[TH, TH] += more * np.outer(R[2], R[2])
+        self.k[K.SUM_WEIGHT :] = 0.0
 
     def _shown(self, learned: bool) -> tuple[Array, Array]:
         rate = self.k[K.LAST_GYRO : K.LAST_GYRO + 3] - self.x[BI]
@@ -259,7 +277,9 @@ class PlainFilter:
             R2 = shown.as_matrix()[2]
             shown = Rotation.from_rotvec(-np.arctan2(my, mx) * UP) * shown
             J[:, K.FIELD], J[:, K.FIELD + 1] = R2 * my / (mx * mx + my * my), -R2 * mx / (mx * mx + my * my)
-        return np.asarray(shown.as_quat(scalar_first=True)), J @ self.P @ J.T
+        up = shown.as_matrix()[2]
+        unknown = K.UNKNOWN_YAW_RAD2 * (self.k[K.NORTH_SET] < 1.0) * np.outer(up, up)
+        return np.asarray(shown.as_quat(scalar_first=True)), J @ self.P @ J.T + unknown
 
 
 def _smooth(k: Array, start: int, new: Array, fade: float) -> None:

@@ -77,7 +77,8 @@ def map_reference(
 ) -> MagneticReference:
     """The map where the device is: mean (n, 3), sd (n, 3), and what an uncertain place adds, J P J^T (Kuevor, B20).
 
-    gradient_uT_per_m (n, 3, 3), derivative of component i along axis j; position_covariance_m2 (3, 3) or (n, 3, 3).
+    gradient_uT_per_m (n, 3, d), derivative of component i along axis j, of x and y or of all three;
+    position_covariance_m2 (d, d) or (n, d, d).
     """
     variance = np.square(sd_uT)[:, :, None] * np.eye(3)
     if gradient_uT_per_m is not None and position_covariance_m2 is not None:
