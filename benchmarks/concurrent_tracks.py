@@ -27,6 +27,7 @@ from app.field.error_structure import ErrorStructure
 from app.field.grid import FieldGrid
 from app.positioning.locate import prepare_floor
 from app.services.artefacts import grid_to_bytes
+from app.services.track_spec import StepKind
 from app.services.track_steps import core_step
 from app.settings import Settings
 from app.tracking.options import TrackOptions
@@ -193,7 +194,7 @@ def in_process(count: int = 300) -> None:
     for seed in (0, 1):
         state = begin()
         for raw in walk(seed, count):
-            step = core_step(raw, "level")
+            step = core_step(raw, StepKind("level"))
             before = state
             start = time.perf_counter()
             state = follow(tracker, state, step).state

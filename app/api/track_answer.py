@@ -39,6 +39,20 @@ class ModeView(BaseModel):
     probability: float
 
 
+class AttitudeView(BaseModel):
+    """How the device is turned; angles are yaw, pitch, roll of 3-2-1, z up, with their sds."""
+
+    frame: Annotated[Literal["building", "relative"], Field(description="relative: the level frame of the first step")]
+    orientation: Annotated[list[float], Field(description="the sensor's axes to the frame, [w, x, y, z]")]
+    yaw_rad: float
+    pitch_rad: float
+    roll_rad: float
+    yaw_sd_rad: Annotated[float, Field(description="1.8 where nothing is known of it yet")]
+    pitch_sd_rad: float
+    roll_sd_rad: float
+    disturbed: Annotated[bool | None, Field(description="the last magnetometer reading did not fit; null: none came")]
+
+
 class EstimateView(BaseModel):
     """The belief after a step. Places are null while nothing was found."""
 
@@ -63,6 +77,13 @@ class EstimateView(BaseModel):
     step_scale: Annotated[float | None, Field(description="true length of displacements over what was told")]
     particles: int | None
     effective_sample_size: float | None
+    disturbed: Annotated[
+        bool, Field(description="the last readings fit no place of the belief: something magnetic is near, and they "
+                    "count for little")
+    ] = False  # fmt: skip
+    attitude: Annotated[AttitudeView | None, Field(description="of the device, where steps bring inertial samples")] = (
+        None
+    )
 
 
 class TrackView(BaseModel):
@@ -81,6 +102,7 @@ class TrackView(BaseModel):
     prior: dict[str, Any] | None
     orientation_frame: Annotated[OrientationFrame, Field(description="of frame body")]
     calibration: Annotated[AppliedView | None, Field(description="applied to every step; null: none")]
+    attitude: Annotated[dict[str, Any] | None, Field(description="the reference of its own attitude; null: none")]
     next_step: Annotated[int, Field(description="the number waited for; all before it are stored, or were given up")]
     waiting: Annotated[int, Field(description="steps that came before one that is missing")]
     idle_timeout_s: float
@@ -160,7 +182,8 @@ def show_track(row: Track, idle: bool, idle_timeout_s: float) -> TrackView:
         map_ids=[each[1] for each in row.spec["maps"]],
         options={name.replace("_uT", "_ut"): value for name, value in row.spec["options"].items()},
         prior=row.spec["prior"], orientation_frame=row.spec.get("orientation_frame", "building"),
-        calibration=_calibration(row), next_step=row.next_step, waiting=len(row.waiting), idle_timeout_s=idle_timeout_s,
+        calibration=_calibration(row), attitude=row.spec.get("attitude"),
+        next_step=row.next_step, waiting=len(row.waiting), idle_timeout_s=idle_timeout_s,
         created_at=row.created_at, last_step_at=row.touched_at, ended_at=row.ended_at,
         links={
             "self": path, "steps": f"{path}/steps", "stream": f"{path}/stream", "path": f"{path}/path",

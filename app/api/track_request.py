@@ -2,15 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
+from app.api.attitudes import ImuRow
 from app.api.locate_request import FloorId, Microtesla, OrientationFrame, PriorBody, Quaternion, Radians, Vector
 from app.api.models import Finite, Name, RequestModel
 from app.errors import Fault, InvalidInput
 from app.services.step_order import RawStep
+from app.services.track_spec import StepKind
 from app.survey.units import MAX_FIELD_UT, MIN_FIELD_UT, field_faults
 from app.tracking.options import StartPrior, TrackOptions
 
@@ -18,6 +21,8 @@ __all__ = ["MOST_STEPS", "NewTrack", "StepBody", "StepsBody", "Frame", "core_opt
 
 MOST_STEPS = 500
 """In one request, or message."""
+MOST_INERTIAL = 500
+"""Samples in one step."""
 MOST_NUMBER = 2**53 - 1  # as far as JSON's numbers are whole everywhere
 _UNIT_FROM = 10  # readings whose median may be judged
 
@@ -28,6 +33,36 @@ Displacement = Annotated[float, Field(allow_inf_nan=False, ge=-2000, le=2000)]
 
 def _shape_of_field(value: object) -> str:
     return "vectors" if isinstance(value, list) else "magnitudes"
+
+
+class InertialBody(RequestModel):
+    """Samples of a device, null where a sensor has none; at rest the accelerometer reads +g upwards."""
+
+    t_s: Annotated[list[Finite], Field(min_length=1, max_length=MOST_INERTIAL)]
+    gyro_rad_per_s: Annotated[list[ImuRow], Field(max_length=MOST_INERTIAL)]
+    accelerometer_m_per_s2: Annotated[list[ImuRow], Field(max_length=MOST_INERTIAL)]
+    magnetometer_ut: Annotated[list[ImuRow] | None, Field(max_length=MOST_INERTIAL)] = None
+
+    @model_validator(mode="after")
+    def _lengths_agree(self) -> Self:
+        for name in ("gyro_rad_per_s", "accelerometer_m_per_s2", "magnetometer_ut"):
+            rows = getattr(self, name)
+            if rows is not None and len(rows) != len(self.t_s):
+                raise ValueError(f"{name} has {len(rows)} rows, t_s has {len(self.t_s)}; they must be equal")
+        if any(after <= before for before, after in pairwise(self.t_s)):
+            raise ValueError("t_s has to increase from each sample to the next")
+        return self
+
+
+class TrackAttitude(RequestModel):
+    """The track also follows how the device is turned, from `inertial` samples of its steps.
+
+    map: against the map where the track believes it is, from when it has converged. wmm: against the Earth's field at
+    the building's anchor. none: gyroscope and accelerometer; frame body with orientation_frame level may then leave
+    orientation out of its steps.
+    """
+
+    reference: Literal["none", "wmm", "map"] = "map"
 
 
 class StepBody(RequestModel):
@@ -52,6 +87,10 @@ class StepBody(RequestModel):
     ] = None
     orientation: Annotated[
         Quaternion | None, Field(description="of frame body: the sensor's axes to orientation_frame, [w, x, y, z]")
+    ] = None
+    inertial: Annotated[
+        InertialBody | None,
+        Field(description="samples since the step before, in the sensor's axes, of a track with `attitude`"),
     ] = None
     heading_rad: Annotated[Radians | None, Field(description="yaw of the track's frame in the building, if known")] = (
         None
@@ -168,6 +207,7 @@ class NewTrack(RequestModel):
     device: Annotated[
         Name | None, Field(description="the same by name: its newest calibration, for the whole track")
     ] = None
+    attitude: Annotated[TrackAttitude | None, Field(description="null: no attitude is followed")] = None
     options: Annotated[TrackOptionsBody, Field(default_factory=lambda: TrackOptionsBody.model_validate({}))]
     prior: Annotated[PriorBody | None, Field(description="where the first step is; null: anywhere")] = None
     seed: Annotated[int | None, Field(ge=0, le=MOST_NUMBER, description="of all that is drawn; default: a new one")] = (
@@ -199,12 +239,12 @@ def core_prior(body: PriorBody | None) -> StartPrior | None:
     return None if body is None else StartPrior((*body.position_m,), body.sd_m)  # type: ignore[arg-type]
 
 
-def raw_steps(body: StepsBody, frame: str) -> list[RawStep]:
+def raw_steps(body: StepsBody, kind: StepKind) -> list[RawStep]:
     """Steps as they are stored and followed, checked as far as that goes without the others.
 
     Raises InvalidInput, with the place of each fault.
     """
-    faults = [fault for index, step in enumerate(body.steps) for fault in _shape_faults(step, frame, index)]
+    faults = [fault for index, step in enumerate(body.steps) for fault in _shape_faults(step, kind, index)]
     if faults:
         raise InvalidInput(faults[0].reason, *faults[:50])
     steps = [step.model_dump(exclude_none=True) for step in body.steps]
@@ -212,14 +252,18 @@ def raw_steps(body: StepsBody, frame: str) -> list[RawStep]:
     return steps
 
 
-def _shape_faults(step: StepBody, frame: str, index: int) -> list[Fault]:
+def _shape_faults(step: StepBody, kind: StepKind, index: int) -> list[Fault]:
+    frame = kind.frame
     where = f"/body/steps/{index}"
     faults = []
     if step.b_ut is not None and isinstance(step.b_ut, list) == (frame == "norm"):
         faults.append(
             Fault(f"{where}/b_ut", f"in frame {frame} b_ut is {'|B|' if frame == 'norm' else '[bx, by, bz]'}")
         )
-    if frame == "body" and step.b_ut is not None and step.orientation is None:
+    if step.inertial is not None and not kind.attitude:
+        faults.append(Fault(f"{where}/inertial", "this track follows no attitude; make it with `attitude`"))
+    turned = step.orientation is not None or (kind.own_orientation and step.inertial is not None)
+    if frame == "body" and step.b_ut is not None and not turned:
         faults.append(
             Fault(f"{where}/orientation", "frame body needs it: [w, x, y, z], the sensor's axes to orientation_frame")
         )

@@ -29,6 +29,7 @@ from app.api.track_request import MOST_STEPS, StepsBody, raw_steps
 from app.errors import Conflict, Fault, InvalidInput, IsodynError, NotFound
 from app.services.follow import Outcome
 from app.services.step_order import RawStep
+from app.services.track_spec import StepKind
 
 __all__ = ["CLOSE_ENDED", "CLOSE_NOT_FOUND", "CLOSE_UNAUTHORISED", "router"]
 
@@ -58,13 +59,13 @@ async def stream(browser: WebSocket, track_id: str) -> None:
         _check_origin(browser)
         identity = await recognised(context, secret, "locate")
         work = partial(_ready, context, identity, track_id)
-        frame, ready = await asyncio.get_running_loop().run_in_executor(context.follows, work)
+        kind, ready = await asyncio.get_running_loop().run_in_executor(context.follows, work)
     except IsodynError as error:
         await browser.send_denial_response(isodyn_problem(error))
         return
     offered = browser.scope.get("subprotocols", ())
     await browser.accept(subprotocol=PROTOCOL if PROTOCOL in offered else None)
-    await _Stream(browser, context, secret, track_id, frame).run(ready)
+    await _Stream(browser, context, secret, track_id, kind).run(ready)
 
 
 def _secret(browser: WebSocket) -> str | None:
@@ -83,22 +84,22 @@ def _check_origin(browser: WebSocket) -> None:
         raise Forbidden("this page is of another origin; streams are for devices, and for pages of this server")
 
 
-def _ready(context: Context, identity: Identity, track_id: str) -> tuple[str, dict[str, Any]]:
-    """The track's frame, and the first message. Raises NotFound, Conflict."""
+def _ready(context: Context, identity: Identity, track_id: str) -> tuple[StepKind, dict[str, Any]]:
+    """What the track's steps are, and the first message. Raises NotFound, Conflict."""
     live = context.follower.live(track_id, identity.organisation_id)
     context.follower.check_active(live)
-    return live.frame, {
-        "type": "ready", "track_id": track_id, "status": "active", "frame": live.frame, "next_step": live.next_step,
-        "waiting": len(live.waiting), "most_steps": MOST_STEPS, "estimate": live.estimate,
+    return live.kind, {
+        "type": "ready", "track_id": track_id, "status": "active", "frame": live.kind.frame,
+        "next_step": live.next_step, "waiting": len(live.waiting), "most_steps": MOST_STEPS, "estimate": live.estimate,
     }  # fmt: skip
 
 
 class _Stream:
     """One connection: a task reads ahead, and batch after batch is followed and answered."""
 
-    def __init__(self, browser: WebSocket, context: Context, secret: str | None, track_id: str, frame: str) -> None:
+    def __init__(self, browser: WebSocket, context: Context, secret: str | None, track_id: str, kind: StepKind) -> None:
         self._browser, self._context, self._secret = browser, context, secret
-        self._track_id, self._frame = track_id, frame
+        self._track_id, self._kind = track_id, kind
         self._read: asyncio.Queue[str | bytes | None] = asyncio.Queue()
         self._ahead_bytes, self._room = 0, asyncio.Event()
         self._gone = False
@@ -150,7 +151,7 @@ class _Stream:
         read = []
         for message in messages:
             try:
-                read.append(_read_message(message, self._frame))
+                read.append(_read_message(message, self._kind))
             except ValidationError as error:
                 found = [{**each, "loc": ("body", *each["loc"])} for each in error.errors()]
                 await self._problem(validation_problem(found))
@@ -203,7 +204,7 @@ def _estimate(outcome: Outcome) -> dict[str, Any]:
     return {"type": "estimate", **steps_answer(outcome)}
 
 
-def _read_message(message: str | bytes, frame: str) -> _Message:
+def _read_message(message: str | bytes, steps_are: StepKind) -> _Message:
     """Raises InvalidInput, ValidationError."""
     try:
         told = msgspec.json.decode(message)
@@ -216,7 +217,7 @@ def _read_message(message: str | bytes, frame: str) -> _Message:
         reason = 'a message is {"type": "steps", "steps": [...]} or {"type": "step", "number": ..., ...}'
         raise InvalidInput(reason, Fault("/body/type", reason))
     body = StepsBody.model_validate(told)
-    return _Message(raw_steps(body, frame), body.flush)
+    return _Message(raw_steps(body, steps_are), body.flush)
 
 
 def _joined(messages: Sequence[_Message]) -> list[list[_Message]]:

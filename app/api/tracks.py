@@ -1,7 +1,8 @@
 """Tracks: follow a device step by step, read where it was, and follow it again."""
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
+from datetime import UTC, datetime
 from secrets import randbits
 from typing import Annotated, Any, Literal
 
@@ -40,12 +41,13 @@ from app.api.track_request import NewTrack, StepsBody, core_options, core_prior,
 from app.db.tables import Building, Floor, Track, TrackSteps
 from app.errors import Conflict, Fault, InvalidInput, TooMany
 from app.services.calibrations import find_calibration
+from app.services.estimate_attitude import AskedReference, check_vector, find_reference
 from app.services.locate_window import ActiveMap, active_maps
 from app.services.replay_track import ReplayedBatch, replay_track
 from app.services.step_order import RawStep
 from app.services.track_estimate import SEARCHING, unsettled_rows
 from app.services.track_log import batches_of, delete_track, end_track
-from app.services.track_spec import check_walkable, make_spec
+from app.services.track_spec import StepKind, check_walkable, make_spec, step_kind
 
 __all__ = ["router"]
 
@@ -67,11 +69,12 @@ def create_track(
         floors, maps = _floors_and_maps(session, identity, body)
         ground = read_ground(body.options, {each.floor_id: floors[each.floor_id].outline for each in maps})
         calibration = find_calibration(session, identity.organisation_id, body.calibration_id, body.device)
+        attitude = _attitude(session, identity, body, next(iter(floors.values())), context, maps)
         row = Track(
             organisation_id=identity.organisation_id, key_id=identity.key_id, name=body.name, frame=body.frame,
             building_id=next(iter(floors.values())).building_id, seed=randbits(53) if body.seed is None else body.seed,
             spec=make_spec(maps, core_options(body.options), core_prior(body.prior), ground,
-                           body.orientation_frame, calibration),
+                           body.orientation_frame, calibration, attitude),
         )  # fmt: skip
         check_walkable(context.follower.trackers.make(row.spec, row.frame, row.seed))
         session.add(row)
@@ -79,6 +82,23 @@ def create_track(
         return 201, _detail(context, row, SEARCHING)
 
     return answer_once(context, identity, request, key, raw, create)
+
+
+def _attitude(
+    session: Session, identity: Identity, body: NewTrack, floor: Floor, context: Context, maps: Sequence[ActiveMap]
+) -> dict[str, Any] | None:
+    """The reference of the track's own attitude, pinned. Raises InvalidInput, IncompatibleFrames."""
+    if body.attitude is None:
+        return None
+    kind = body.attitude.reference
+    if kind == "map":
+        for each in maps:
+            check_vector(context.grids.grid(each.grid_sha256))
+    if kind != "wmm":
+        return {"reference": kind}
+    asked = AskedReference("wmm", floor.building_id, None, None, 0.0, None, None, datetime.now(UTC).date())
+    _, told = find_reference(session, context.grids, identity.organisation_id, asked)
+    return {"reference": kind, **told}
 
 
 def _check_count(session: Session, context: Context, identity: Identity) -> None:
@@ -164,8 +184,8 @@ def stop_track(track_id: Id, context: ContextDep, identity: Locating) -> TrackVi
 async def post_steps(track_id: Id, body: StepsBody, context: ContextDep, identity: Locating) -> Response:
     """Whole, or not at all: a fault anywhere refuses the batch. Send again what was not answered: a step that was
     followed already is a duplicate, and changes nothing. What is answered is stored."""
-    frame = await run_in_threadpool(_frame_of, context, identity, track_id)
-    steps = raw_steps(body, frame)
+    kind = await run_in_threadpool(_kind_of, context, identity, track_id)
+    steps = raw_steps(body, kind)
     wait_s = context.step_rate.take(track_id, len(steps))
     if wait_s > 0.0:
         raise TooMany(
@@ -261,13 +281,14 @@ async def _lines(context: Context, begun: Iterator[ReplayedBatch]) -> AsyncItera
     yield end.model_dump_json().encode() + b"\n"
 
 
-def _frame_of(context: Context, identity: Identity, track_id: str) -> str:
+def _kind_of(context: Context, identity: Identity, track_id: str) -> StepKind:
     """Raises NotFound. Asks the database only for a track that is not in memory."""
-    frame = context.follower.frame_of(track_id, identity.organisation_id)
-    if frame is None:
+    kind = context.follower.kind_of(track_id, identity.organisation_id)
+    if kind is None:
         with context.transaction() as session:
-            frame = find_own(session, identity, Track, track_id).frame
-    return frame
+            row = find_own(session, identity, Track, track_id)
+            kind = step_kind(row.spec, row.frame)
+    return kind
 
 
 def _show(context: Context, row: Track) -> TrackView:

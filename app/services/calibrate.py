@@ -18,11 +18,12 @@ from app.calibration.swinging import swinging
 from app.calibration.two_step import two_step
 from app.db.tables import Building
 from app.earth_field import EarthField, earth_field
-from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
+from app.errors import Conflict, Fault, InvalidInput, NotFound
 from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.positioning.window import Window
 from app.services.calibrate_on_map import calibrate_on_map
+from app.services.estimate_attitude import check_vector
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
 
@@ -160,10 +161,7 @@ def _on_a_map(
 
 def _along(grid: FieldGrid, B_uT: Array, rotation: Array, walk: MappedWalk) -> tuple[CalibrationFit, dict[str, Any]]:
     """By positions that were told, where the map has measured."""
-    if grid.components != "vector":
-        raise IncompatibleFrames(
-            f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
-        )
+    check_vector(grid)
     values = grid.at(walk.way_m)
     kept = values.measured
     if kept.sum() < LEAST_MAPPED:

@@ -25,7 +25,7 @@ from app.geometry import Array
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
 
-__all__ = ["AskedReference", "ReferenceKind", "estimate_attitude", "find_reference"]
+__all__ = ["AskedReference", "ReferenceKind", "check_vector", "estimate_attitude", "find_reference"]
 
 ReferenceKind = Literal["none", "learned", "level", "wmm", "map_point", "map"]
 STEEL_UT = 5.0  # sd per axis by which the field of a building departs from the Earth's
@@ -99,10 +99,7 @@ def _of_map(
     if not maps:
         raise Conflict(f"floor {asked.floor_id} has no map yet; upload surveys and wait for its job")
     grid = grids.grid(maps[0].grid_sha256)
-    if grid.components != "vector":
-        raise IncompatibleFrames(
-            f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
-        )
+    check_vector(grid)
     values = grid.at(asked.position_m)
     told: dict[str, Any] = {"floor_id": asked.floor_id, "map_id": maps[0].map_id}
     if asked.kind == "map_point":
@@ -114,6 +111,14 @@ def _of_map(
         return MagneticReference(values.mean_uT[0], np.square(wander)), told
     mapped = float(values.measured.mean())
     return at_places(grid, values, asked.position_sd_m**2 * np.eye(2)), told | {"mapped_share": mapped}
+
+
+def check_vector(grid: FieldGrid) -> None:
+    """Raises IncompatibleFrames for a map that does not tell the field's direction."""
+    if grid.components != "vector":
+        raise IncompatibleFrames(
+            f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
+        )
 
 
 def at_places(grid: FieldGrid, values: FieldValues, covariance_m2: Array) -> MagneticReference:

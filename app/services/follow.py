@@ -18,13 +18,12 @@ from weakref import WeakValueDictionary
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.calibration.sensor_model import SensorModel
 from app.db.tables import Track, utc_now
 from app.errors import Conflict, CorruptArtefact, NotFound
 from app.services.step_order import Arranged, RawStep, arrange
 from app.services.track_estimate import SEARCHING, Told, path_row, settled_row, tell
 from app.services.track_log import Batch, TrackLog, Write, batches_of, end_idle, read_state
-from app.services.track_spec import Trackers, spec_model
+from app.services.track_spec import StepKind, Trackers, step_kind
 from app.services.track_steps import core_step
 from app.tracking.stored_state import state_from_bytes, state_nbytes, state_to_bytes
 from app.tracking.track import Followed, begin, follow
@@ -48,8 +47,7 @@ class Live:
 
     track_id: str
     organisation_id: str
-    frame: str
-    calibration: SensorModel | None
+    kind: StepKind
     tracker: Tracker
     state: TrackState
     version: int
@@ -78,14 +76,14 @@ class Outcome:
 
 
 def follow_steps(
-    tracker: Tracker, state: TrackState, steps: Sequence[RawStep], frame: str, calibration: SensorModel | None,
+    tracker: Tracker, state: TrackState, steps: Sequence[RawStep], kind: StepKind,
     sequence: int, next_step: int,
 ) -> tuple[TrackState, Batch]:  # fmt: skip
     """A batch of steps (one at least), and all that is said of them. Raises InvalidInput."""
     path, settled = [], []
     followed: Followed | None = None
     for raw in steps:
-        step = core_step(raw, frame, calibration)
+        step = core_step(raw, kind)
         followed = follow(tracker, state, step)
         state = followed.state
         path.append(path_row(step, followed))
@@ -152,11 +150,11 @@ class Follower:
         with self._memory:
             self._drop(track_id)
 
-    def frame_of(self, track_id: str, organisation_id: str) -> str | None:
-        """The frame of a track that is in memory; asks nobody."""
+    def kind_of(self, track_id: str, organisation_id: str) -> StepKind | None:
+        """What the steps of a track are that is in memory; asks nobody."""
         with self._memory:
             live = self._live.get(track_id)
-        return live.frame if live is not None and live.organisation_id == organisation_id else None
+        return live.kind if live is not None and live.organisation_id == organisation_id else None
 
     def now(self) -> datetime:
         return self._clock()
@@ -207,7 +205,7 @@ class Follower:
 
     def _restored(self, row: Track, kept: tuple[int, bytes] | None) -> Live:
         tracker = self.trackers.make(row.spec, row.frame, row.seed)
-        calibration = spec_model(row.spec)
+        kind = step_kind(row.spec, row.frame)
         batches, state = 0, begin()
         if kept is not None:
             try:
@@ -219,14 +217,12 @@ class Follower:
         # The last batch is read in any case: it says what was answered.
         for batch, _ in batches_of(self._sessions, row.id, max(min(batches, row.batches) - 1, 0), row.batches):
             if batch.sequence >= batches:
-                state, _ = follow_steps(
-                    tracker, state, batch.steps, row.frame, calibration, batch.sequence, batch.next_step
-                )
+                state, _ = follow_steps(tracker, state, batch.steps, kind, batch.sequence, batch.next_step)
             else:
                 kept_step = batch.next_step
             estimate, last = batch.estimate, batch.steps[-1]
         return Live(
-            row.id, row.organisation_id, row.frame, calibration, tracker, state, row.version, row.batches,
+            row.id, row.organisation_id, kind, tracker, state, row.version, row.batches,
             row.next_step, tuple(row.waiting), tuple((first, stop) for first, stop in row.gaps), last, estimate,
             kept_step, row.touched_at, row.ended_reason,
         )  # fmt: skip
@@ -254,7 +250,7 @@ def _go_on(live: Live, arranged: Arranged, now: datetime) -> tuple[Live, Write]:
     state, estimate, batch = live.state, live.estimate, None
     if arranged.ready:
         state, batch = follow_steps(
-            live.tracker, state, arranged.ready, live.frame, live.calibration, live.batches, arranged.next_step
+            live.tracker, state, arranged.ready, live.kind, live.batches, arranged.next_step
         )  # fmt: skip
         estimate = batch.estimate
     keeps = arranged.next_step >= live.kept_step + STATE_EVERY

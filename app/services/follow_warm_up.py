@@ -5,6 +5,7 @@ import numpy as np
 from app.field.grid import FieldGrid
 from app.positioning.locate import prepare_floor
 from app.services.step_order import RawStep
+from app.services.track_spec import StepKind
 from app.services.track_steps import core_step
 from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.track import begin, follow, make_tracker
@@ -24,4 +25,4 @@ def warm_up_tracks() -> None:
     state = begin()
     for number in range(2):
         raw: RawStep = {"number": number, "t_s": 0.0, "b_ut": [20.0] * 3, "displacement_m": [float(number), 0.0, 0.0]}
-        state = follow(tracker, state, core_step(raw, "level")).state
+        state = follow(tracker, state, core_step(raw, StepKind("level"))).state

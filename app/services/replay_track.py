@@ -10,7 +10,7 @@ from app.db.tables import Track
 from app.services.follow import follow_steps
 from app.services.track_estimate import Told
 from app.services.track_log import batches_of
-from app.services.track_spec import Trackers, spec_model
+from app.services.track_spec import Trackers, step_kind
 from app.tracking.track import begin
 
 __all__ = ["ReplayedBatch", "replay_track"]
@@ -32,11 +32,11 @@ class ReplayedBatch:
 def replay_track(sessions: sessionmaker[Session], trackers: Trackers, track: Track) -> Iterator[ReplayedBatch]:
     """Batch after batch, up to where the track is now."""
     tracker = trackers.make(track.spec, track.frame, track.seed)
-    calibration = spec_model(track.spec)
+    kind = step_kind(track.spec, track.frame)
     state, chain = begin(), sha256()
     for stored, digest in batches_of(sessions, track.id, 0, track.batches):
         state, batch = follow_steps(
-            tracker, state, stored.steps, track.frame, calibration, stored.sequence, stored.next_step
+            tracker, state, stored.steps, kind, stored.sequence, stored.next_step
         )  # fmt: skip
         now = batch.digest()
         chain.update(now.encode())

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from app.attitude.euler import euler_zyx_rad, euler_zyx_variance_rad2
+from app.tracking.attitude import Attitude
 from app.tracking.estimate import Estimate
 from app.tracking.particles import weights
 from app.tracking.smoother import Smoothed, settle
@@ -32,6 +34,8 @@ SEARCHING: Told = {
         "floor_probability", "measured", "step_scale", "particles", "effective_sample_size",
     )),
     "modes": [],
+    "disturbed": False,
+    "attitude": None,
 }  # fmt: skip
 """The estimate of a track before its first step."""
 
@@ -50,6 +54,8 @@ def tell(tracker: Tracker, followed: Followed) -> Told:
         "step": state.step.number,
         "t_s": state.step.t_s,
         "probability": followed.probability,
+        "disturbed": state.disturbed_from_m is not None,
+        "attitude": None if state.turned is None else _attitude(tracker, state, state.turned),
     }
     return told if estimate is None else told | _place(tracker, estimate)
 
@@ -77,6 +83,21 @@ def _place(tracker: Tracker, estimate: Estimate) -> Told:
             for spot in estimate.spots
         ],
     }  # fmt: skip
+
+
+def _attitude(tracker: Tracker, state: TrackState, attitude: Attitude) -> Told:
+    q, covariance = attitude.q_body_to_frame[None], attitude.covariance_rad2[None]
+    assert tracker.attitude is not None
+    return {
+        "frame": "relative" if tracker.attitude.kind == "none" else "building",
+        "orientation": attitude.q_body_to_frame.tolist(),
+        **{name: float(angle[0]) for name, angle in euler_zyx_rad(q)._asdict().items()},
+        **{
+            name.replace("_rad2", "_sd_rad"): float(np.sqrt(variance[0]))
+            for name, variance in euler_zyx_variance_rad2(q, covariance)._asdict().items()
+        },
+        "disturbed": attitude.disturbed,
+    }
 
 
 def _share(p: float) -> float:

@@ -6,7 +6,7 @@ track later on, whatever was built or tuned since.
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -21,17 +21,18 @@ from app.positioning.window import WindowFrame
 from app.services.calibrations import AppliedCalibration, model_as_json, stored_model
 from app.services.grid_cache import GridCache
 from app.services.locate_window import ActiveMap
+from app.tracking.attitude import AttitudeReference
 from app.tracking.ground import Connector, Ground, barriers_of
 from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.track import make_tracker
 from app.tracking.track_state import Tracker
 
-__all__ = ["TrackSpec", "Trackers", "check_walkable", "core_frame", "make_spec", "spec_model"]
+__all__ = ["StepKind", "TrackSpec", "Trackers", "check_walkable", "core_frame", "make_spec", "step_kind"]
 
 TrackSpec = dict[str, Any]
 """`maps` [[floor id, map id, hash of the grid]], `options` by name, `prior`, and `ground`: `walkable` polygons and
 `walls` by floor id, `connectors`; all coordinates building metres; `orientation_frame` and `calibration` of frame
-body."""
+body; `attitude`: the reference of its own attitude."""
 
 _MOST_TRACKERS = 32
 
@@ -50,6 +51,7 @@ def make_spec(
     ground: Mapping[str, Any],
     orientation_frame: str,
     calibration: AppliedCalibration | None,
+    attitude: Mapping[str, Any] | None,
 ) -> TrackSpec:
     """Everything that is pinned, as JSON."""
     told = {name: value for name, value in asdict(replace(options, ground=None)).items() if name != "ground"}
@@ -60,13 +62,27 @@ def make_spec(
         "ground": dict(ground),
         "orientation_frame": orientation_frame,
         "calibration": None if calibration is None else calibration.told | model_as_json(calibration.model),
+        "attitude": None if attitude is None else dict(attitude),
     }
 
 
-def spec_model(spec: TrackSpec) -> SensorModel | None:
-    """What the readings of a track are calibrated by."""
-    told = spec.get("calibration")
-    return None if told is None else stored_model(told)
+@dataclass(frozen=True, slots=True, eq=False)
+class StepKind:
+    """What the steps of a track are: their frame, what readings are calibrated by, whether they may bring inertial
+
+    samples, and whether those tell the orientation that readings of frame body are turned by.
+    """
+
+    frame: str
+    calibration: SensorModel | None = None
+    attitude: bool = False
+    own_orientation: bool = False
+
+
+def step_kind(spec: TrackSpec, frame: str) -> StepKind:
+    told, attitude = spec.get("calibration"), spec.get("attitude")
+    own = attitude is not None and attitude["reference"] == "none" and core_frame(spec, frame) == "level"
+    return StepKind(frame, None if told is None else stored_model(told), attitude is not None, frame == "body" and own)
 
 
 class Trackers:
@@ -92,6 +108,7 @@ class Trackers:
             barriers=barriers_of(walls, [floor.floor_id for floor in shared.floors]),
             seed=seed,
             prior=None if prior is None else StartPrior((*prior["position_m"],), prior["sd_m"]),
+            attitude=_attitude(spec.get("attitude")),
         )
 
     def _of_maps(self, maps: tuple[tuple[str, str], ...], frame: WindowFrame) -> Tracker:
@@ -122,6 +139,14 @@ def check_walkable(tracker: Tracker) -> None:
                 return
     reason = "the walkable area holds no mapped place of any floor; draw it in building metres, over the map"
     raise InvalidInput(reason, Fault("/body/options/walkable", reason))
+
+
+def _attitude(told: Mapping[str, Any] | None) -> AttitudeReference | None:
+    if told is None:
+        return None
+    if told["reference"] == "wmm":
+        return AttitudeReference("constant", np.asarray(told["b_ut"], dtype=np.float64), told["sd_ut"])
+    return AttitudeReference("map" if told["reference"] == "map" else "none")
 
 
 def _ground(told: Mapping[str, Any]) -> Ground | None:

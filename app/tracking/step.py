@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from app.attitude.options import InertialSamples
 from app.geometry import Array
 
 __all__ = ["Step"]
@@ -20,6 +21,8 @@ class Step:
                        it does not know how it moves
     yaw_rad            of the device since the first step (None: it turns with the path)
     device_to_frame    (3, 3) rotation of the sensor's axes to the track's frame, or None: level, turned by yaw_rad
+    inertial           samples since the step before, for the track's own attitude (None: there are none)
+    B_body_uT          (3,) the reading in the sensor's axes, to be turned by that attitude; B_uT is None then
     heading_rad, heading_sd_rad   yaw of the track's frame in the building as the device believes it now (None: unknown)
     """
 
@@ -31,3 +34,5 @@ class Step:
     device_to_frame: Array | None = None
     heading_rad: float | None = None
     heading_sd_rad: float | None = None
+    inertial: InertialSamples | None = None
+    B_body_uT: Array | None = None

@@ -20,6 +20,7 @@ from app.errors import Fault, InvalidInput
 from app.positioning.features import common_components
 from app.positioning.floors import SearchableFloor, reduce_floor, shared_noise_sd_uT
 from app.positioning.window import WindowFrame
+from app.tracking.attitude import oriented
 from app.tracking.disturbance import LONGEST_M, is_disturbed, softened
 from app.tracking.estimate import Estimate, carried_on
 from app.tracking.gather import gathered, moved_on
@@ -100,6 +101,8 @@ def begin() -> TrackState:
 def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
     """One step on. Raises InvalidInput for a step that is not after the last one."""
     _check(state, step)
+    if step.inertial is not None:
+        step, state = oriented(tracker, state, step, _carried(state))
     state = moved_on(tracker, state, step)
     reading, state = gathered(tracker, state, step)
     if reading is None:
@@ -129,11 +132,15 @@ def follow(tracker: Tracker, state: TrackState, step: Step) -> Followed:
 
 
 def _followed(state: TrackState, settled: tuple[Smoothed, ...]) -> Followed:
+    return Followed(state, _carried(state), state.probability, settled)
+
+
+def _carried(state: TrackState) -> Estimate | None:
     """The belief, carried on to where the device is by now from where it was last compared with the map."""
     estimate = state.estimate
     if estimate is not None and state.place_m is not None and state.estimate_from_m is not None:
-        estimate = carried_on(estimate, state.place_m - state.estimate_from_m)
-    return Followed(state, estimate, state.probability, settled)
+        return carried_on(estimate, state.place_m - state.estimate_from_m)
+    return estimate
 
 
 def _check(state: TrackState, step: Step) -> None:

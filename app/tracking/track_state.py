@@ -5,9 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import expit
 
+from app.attitude.mekf import AttitudeState
 from app.geometry import Array
 from app.positioning.floors import SearchableFloor
 from app.positioning.window import WindowFrame
+from app.tracking.attitude import Attitude, AttitudeReference
 from app.tracking.estimate import Estimate, State, describe
 from app.tracking.ground import Barriers
 from app.tracking.no_map import NoMap
@@ -34,6 +36,7 @@ class Tracker:
     options: TrackOptions
     seed: int
     prior: StartPrior | None = None
+    attitude: AttitudeReference | None = None
 
     @property
     def spacing_m(self) -> float:
@@ -60,6 +63,7 @@ class TrackState:
     searched_m      path at the last search
     tells_height    whether the device ever said that it rose or sank
     estimate_from_m (3,) where the device reckoned to be when the estimate was made
+    attitude, turned   of the attitude filter, where inertial samples are sent: its state, and what it says
     disturbed_from_m, disturbed   path at which readings began to be disturbed, if the last one was; how many were
     """
 
@@ -85,6 +89,8 @@ class TrackState:
     converged_at_m: float | None = None
     disturbed_from_m: float | None = None
     disturbed: int = 0
+    attitude: AttitudeState | None = None
+    turned: Attitude | None = None
 
     @property
     def probability(self) -> float:

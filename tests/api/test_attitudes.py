@@ -84,7 +84,6 @@ def test_without_a_reference_gravity_is_up_and_yaw_is_relative(service: Any, car
     told = ask(service, columns, {"kind": "none"})
     assert told["frame"] == "relative"
     assert told["calibration"] is None
-    _, tilt = errors_deg(told, truth)
     at = np.round(np.array(told["t_s"]) * RATE_HZ).astype(int)
     up = Rotation.from_quat(told["orientation"], scalar_first=True).inv().apply([0, 0, 1])
     off = np.degrees(np.arccos(np.clip(np.sum(up * truth[at].inv().apply([0, 0, 1]), axis=1), -1, 1)))
@@ -186,3 +185,90 @@ def test_of_others_nothing_is_told(
     answer = service.http.post("/v1/attitudes", json=body | {"reference": unanchored})
     assert answer.status_code == 422
     assert "anchor" in answer.text
+
+
+def steps_of(carried: Any, *, body: bool, per_step: int = 5) -> list[dict[str, Any]]:
+    """The walk as a track's steps, ten a second, each with the inertial samples since the one before."""
+    columns, p, truth = carried
+    level = Rotation.from_euler("z", -truth[0].as_euler("ZYX")[0])
+    steps = []
+    for number, end in enumerate(range(per_step, len(p), per_step)):
+        rows = slice(end - per_step, end)
+        inertial = {name: values[rows] for name, values in columns.items()}
+        reading = np.array([row for row in inertial["magnetometer_ut"] if row is not None]).mean(axis=0)
+        at = end - 1
+        step = {"number": number, "t_s": columns["t_s"][at], "inertial": inertial}
+        if body:
+            step |= {"b_ut": reading.tolist(), "displacement_m": level.apply(p[at] - p[per_step - 1]).tolist()}
+        else:
+            turned = truth[at].apply(reading)
+            step |= {"b_ut": turned.tolist(), "displacement_m": (p[at] - p[per_step - 1]).tolist()}
+        steps.append(step)
+    return steps
+
+
+def test_a_track_follows_the_attitude_against_the_map_where_it_is(
+    service: Any, anchored_floor: str, carried: Any
+) -> None:
+    """Yaw is not known before the track has converged; then the map tells the building's own north."""
+    made = service.http.post("/v1/tracks", json={
+        "floor_ids": [anchored_floor], "frame": "building", "attitude": {"reference": "map"}, "seed": 5,
+        "options": {"particles": 1000, "noise_ut": 0.3, "speed_m_s": 1.5}})  # fmt: skip
+    assert made.status_code == 201, made.text
+    track = made.json()
+    assert track["attitude"] == {"reference": "map"}
+    steps = steps_of(carried, body=False)
+    path = f"/v1/tracks/{track['id']}/steps"
+    first = service.http.post(path, json={"steps": steps[:5]}).json()["estimate"]
+    assert first["attitude"]["frame"] == "building"
+    assert first["attitude"]["yaw_sd_rad"] > 1.0
+    assert first["attitude"]["pitch_sd_rad"] < 0.2
+    for start in range(5, len(steps), 100):
+        answer = service.http.post(path, json={"steps": steps[start : start + 100]})
+        assert answer.status_code == 200, answer.text
+    estimate = answer.json()["estimate"]
+    assert estimate["state"] == "converged"
+    assert estimate["disturbed"] is False
+    attitude = estimate["attitude"]
+    _, _, truth = carried
+    at = round(estimate["t_s"] * RATE_HZ)
+    off = (Rotation.from_quat(attitude["orientation"], scalar_first=True) * truth[at].inv()).as_rotvec(degrees=True)
+    assert np.abs(off[2]) < 5.0
+    assert np.linalg.norm(off[:2]) < 4.0
+    assert attitude["yaw_sd_rad"] < 0.1
+    replayed = service.http.post(f"/v1/tracks/{track['id']}/replay").text.strip().splitlines()[-1]
+    assert '"equal":true' in replayed
+
+
+def test_a_phones_own_attitude_levels_its_readings(service: Any, anchored_floor: str, carried: Any) -> None:
+    """Steps in the device's axes without orientation: the track's own attitude turns them."""
+    asked = {"floor_ids": [anchored_floor], "frame": "body", "orientation_frame": "level", "seed": 5,
+             "attitude": {"reference": "none"}, "options": {"particles": 1000, "noise_ut": 0.3}}  # fmt: skip
+    track = service.http.post("/v1/tracks", json=asked).json()
+    steps = steps_of(carried, body=True)
+    for start in range(0, len(steps), 100):
+        answer = service.http.post(f"/v1/tracks/{track['id']}/steps", json={"steps": steps[start : start + 100]})
+        assert answer.status_code == 200, answer.text
+    estimate = answer.json()["estimate"]
+    _, p, _ = carried
+    assert estimate["state"] == "converged", estimate
+    assert np.hypot(*(np.array(estimate["position_m"][:2]) - p[round(estimate["t_s"] * RATE_HZ)][:2])) < 0.6
+    assert estimate["attitude"]["frame"] == "relative"
+
+
+def test_inertial_samples_need_a_track_with_attitude_and_increasing_times(
+    service: Any, anchored_floor: str, building: str, carried: Any
+) -> None:
+    plain = {"floor_ids": [anchored_floor], "frame": "building"}
+    steps = steps_of(carried, body=False)[:2]
+    track = service.http.post("/v1/tracks", json=plain).json()["id"]
+    answer = service.http.post(f"/v1/tracks/{track}/steps", json={"steps": steps})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["location"] == "/body/steps/0/inertial"
+    track = service.http.post("/v1/tracks", json=plain | {"attitude": {"reference": "wmm"}}).json()
+    assert track["attitude"]["model"] == "WMM-2025"
+    again = [steps[0], steps[1] | {"inertial": steps[0]["inertial"]}]
+    answer = service.http.post(f"/v1/tracks/{track['id']}/steps", json={"steps": again})
+    assert answer.status_code == 422, answer.text
+    answer = service.http.post(f"/v1/tracks/{track['id']}/steps", json={"steps": steps})
+    assert answer.status_code == 200, "nothing of the refused batch was followed"

@@ -22,7 +22,7 @@ from app.services.locate_window import ActiveMap
 from app.services.manage_keys import ensure_admin_key
 from app.services.replay_track import replay_track
 from app.services.track_log import batches_of, delete_track
-from app.services.track_spec import Trackers, check_walkable, core_frame, make_spec
+from app.services.track_spec import StepKind, Trackers, check_walkable, core_frame, make_spec
 from app.services.track_steps import core_step
 from app.tracking.options import StartPrior, TrackOptions
 from app.tracking.track import begin, follow, make_tracker
@@ -65,7 +65,7 @@ class World:
             made = session.scalars(select(Map).where(Map.floor_id == self.floor_id)).one()
         assert made.grid_sha256 is not None
         return make_spec(
-            [ActiveMap(self.floor_id, made.id, made.grid_sha256)], OPTIONS, prior, ground or {}, "building", None
+            [ActiveMap(self.floor_id, made.id, made.grid_sha256)], OPTIONS, prior, ground or {}, "building", None, None
         )
 
 
@@ -109,7 +109,7 @@ def test_a_track_is_that_of_the_pure_tracker_and_replays_bit_for_bit(
     tracker = make_tracker([prepare_floor(world.floor_id, hall_grid)], core_frame({}, frame), OPTIONS, 7)
     state = begin()
     for raw in steps:
-        followed = follow(tracker, state, core_step(raw, frame))
+        followed = follow(tracker, state, core_step(raw, StepKind(frame)))
         state = followed.state
     last = outcomes[-1].estimate
     assert followed.estimate is not None
