@@ -6,7 +6,8 @@ Each figure is printed beside its target or the source's.
    source gives no ranges: scales are uniform in 0.8-1.2, distortion in +-0.05, biases in +-130 mG. Errors are estimate
    less truth, of the entries of the correction A and of the bias.
 2. The table of (Shockley, 3.6): the source's fit near rho = 1, beside the conic's.
-3. Kuevor's Table 3.1 as truth (R2): 2000 orientations, 0.1 uT, and with a phone's hard iron of 300 uT.
+3. Kuevor's Table 3.1 as truth (R2): 2000 orientations, 0.1 uT, and with a phone's hard iron of 300 uT. Angles within
+   0.01 degrees, always, would take 13,000 readings: their sd is that, whatever the method.
 4. (estimate - truth)^T C^-1 (estimate - truth) of every method: mean over its degrees of freedom, and the share beyond
    the 95 % point of its chi-square.
 
@@ -19,7 +20,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 from threadpoolctl import threadpool_limits
 
 from app.calibration.ellipsoid import ellipsoid
@@ -180,8 +181,15 @@ def kuevor(runs: int, rng: np.random.Generator) -> bool:
             q = np.quantile(worst, [0.5, 0.95, 1.0])
             print(f"   {what:10s} {q[0]:.5f} / {q[1]:.5f} / {q[2]:.5f}  [{unit * s[k].max():.5f}]  {target}"
                   f"  all three {100 * within:.1f} %, each {100 * each:.1f} %")  # fmt: skip
-            good &= within >= (0.99 if what != "angle, deg" else 0.5)
-    print(f"   scales and biases in 99 % of seeds, angles in half (their sd is what it is): {said(good)}")
+            if what != "angle, deg":
+                good &= within >= 0.99
+                continue
+            bound = float(np.mean(2.0 * norm.cdf(target / (unit * s[k])) - 1.0))
+            verdict = "met" if within >= 0.99 else "MISSED"
+            print(f"   {what:10s} within {target} in 99 % of seeds: {verdict}; sds at the "
+                  f"bound of the readings' information allow each in {100 * bound:.1f} %")  # fmt: skip
+            good &= abs(each - bound) < 0.05
+    print(f"   scales and biases in 99 % of seeds, angles as often as their information allows: {said(good)}")
     return good
 
 

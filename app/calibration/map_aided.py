@@ -128,8 +128,11 @@ def _regress(walk: _Walk, prior_mean: Array, prior_sd: Array, noise_uT: float) -
     precision = np.diag(prior_sd**-2.0)
     inflation, theta, covariance, weight = 1.0, prior_mean, np.diag(prior_sd**2), np.ones(n)
     joined = np.concatenate([walk.design, walk.reading_uT[:, :, None]], axis=2)
+    R = walk.design[:, :, :3]
     for _ in range(ROUNDS):
-        whitened = _whiten(joined, walk.map_variance_uT2, white, walk.keep)
+        turned = R @ theta[3:].reshape(3, 3) @ R.transpose(0, 2, 1)  # what the sensor makes of the map's error
+        variance = np.einsum("nij,nj->ni", turned**2, walk.map_variance_uT2)
+        whitened = _whiten(joined, variance, white, walk.keep)
         X, y = whitened[:, :, :12].reshape(-1, 12), whitened[:, :, 12].ravel()
         covariance = np.asarray(np.linalg.inv(X.T @ X / inflation + precision), dtype=np.float64)
         theta = covariance @ (X.T @ y / inflation + precision @ prior_mean)
