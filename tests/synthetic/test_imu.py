@@ -48,7 +48,7 @@ def test_flights_stay_in_the_mapped_room_and_lean_as_thrust_demands(profile: str
     force = (
         Rotation.from_quat(flight.q_body_to_building, scalar_first=True)
         .inv()
-        .apply(flight.acceleration_m_per_s2 + [0.0, 0.0, GRAVITY_M_PER_S2])
+        .apply(flight.acceleration_m_per_s2 + np.array([0.0, 0.0, GRAVITY_M_PER_S2]))
     )
     assert np.abs(force[:, :2]).max() < 1e-9
     assert np.linalg.norm(flight.acceleration_m_per_s2, axis=1).max() < 4.0
