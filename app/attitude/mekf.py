@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from app.attitude import kernel
+from app.attitude import layout
+from app.attitude.kernel import run
 from app.attitude.options import AttitudeOptions, InertialSamples, tuning_of
 from app.attitude.reference import MagneticReference
 from app.errors import Fault, InvalidInput
@@ -32,7 +33,7 @@ class AttitudeState:
     """All that is kept between chunks: four arrays of float64, to be stored as they are.
 
     q_body_to_building (4,); mean (12,): gyro bias rad/s, velocity m/s, learned field and hard iron uT;
-    joint_covariance (15, 15) of attitude error (rad, body's axes) and of `mean`; kept (kernel.KEPT,): times, smoothed
+    joint_covariance (15, 15) of attitude error (rad, body's axes) and of `mean`; kept (layout.KEPT,): times, smoothed
     readings, how long rejected. Where the field is learned, yaw is in the filter's own frame: take it from the run.
     """
 
@@ -60,9 +61,9 @@ class AttitudeState:
     def covariance(self) -> Array:
         """(6, 6) of attitude error and gyro bias, as the source has it: rad, rad/s. Yaw unknown until north is set."""
         P = self.joint_covariance[:6, :6].copy()
-        if self.kept[kernel.NORTH_SET] < 1.0:
+        if self.kept[layout.NORTH_SET] < 1.0:
             up = Rotation.from_quat(self.q_body_to_building, scalar_first=True).as_matrix()[2]
-            P[:3, :3] += kernel.UNKNOWN_YAW_RAD2 * np.outer(up, up)
+            P[:3, :3] += layout.UNKNOWN_YAW_RAD2 * np.outer(up, up)
         return P
 
 
@@ -109,16 +110,16 @@ def begin(
     tilt_rad = START_TILT_RAD if off < 0.05 else MOVING_TILT_RAD
     q = _levelled(mean / size)
     R = Rotation.from_quat(q, scalar_first=True).as_matrix()
-    P = np.zeros((kernel.SIZE, kernel.SIZE))
+    P = np.zeros((layout.SIZE, layout.SIZE))
     P[:3, :3] = R.T @ np.diag([tilt_rad**2, tilt_rad**2, 0.0]) @ R
     sds = [options.gyro_bias_rad_per_s, options.speed_m_per_s if options.translation == "bounded" else 0.0, 0.0,
            options.hard_iron_uT]  # fmt: skip
     P[3:, 3:] = np.diag(np.square(np.repeat(sds, 3)))
-    kept = np.zeros(kernel.KEPT)
-    kept[[kernel.T, kernel.T_GYRO, kernel.T_FORCE, kernel.T_MAG]] = np.nan
-    kept[kernel.STILL_S] = kept[kernel.DISTURBANCE] = -1.0
-    kept[kernel.GRAVITY] = size if off < 0.05 else options.gravity_m_per_s2
-    return AttitudeState(q, np.zeros(kernel.SIZE - 3), P, kept)
+    kept = np.zeros(layout.KEPT)
+    kept[[layout.T, layout.T_GYRO, layout.T_FORCE, layout.T_MAG]] = np.nan
+    kept[layout.STILL_S] = kept[layout.DISTURBANCE] = -1.0
+    kept[layout.GRAVITY] = size if off < 0.05 else options.gravity_m_per_s2
+    return AttitudeState(q, np.zeros(layout.SIZE - 3), P, kept)
 
 
 def _levelled(up_body: Array) -> Array:
@@ -143,8 +144,8 @@ def follow_attitude(
     """
     tuning = tuning_of(options or AttitudeOptions())
     n = len(samples)
-    if n and samples.t_s[0] <= state.kept[kernel.T]:
-        message = f"the first sample is at {samples.t_s[0]} s, the state at {state.kept[kernel.T]} s: send later ones"
+    if n and samples.t_s[0] <= state.kept[layout.T]:
+        message = f"the first sample is at {samples.t_s[0]} s, the state at {state.kept[layout.T]} s: send later ones"
         raise InvalidInput(message, Fault("/t_s/0", "not later than the state"))
     rows, variance = (np.zeros((1, 3)), np.zeros((1, 3, 3))) if reference is None else reference.rows(n)
     arrays = tuple(each.copy() for each in (state.q_body_to_building, state.mean, state.joint_covariance, state.kept))
@@ -153,6 +154,6 @@ def follow_attitude(
     streams = (samples.t_s, samples.gyro_rad_per_s, samples.accelerometer_m_per_s2, samples.magnetometer_uT)
     t, gyro, force, field = (np.ascontiguousarray(each, dtype=np.float64) for each in streams)
     q, mean, P, kept = arrays
-    kernel.run(q, mean, P, kept, t, gyro, force, field, rows, variance, reference is not None, learned, tuning, out)
+    run(q, mean, P, kept, t, gyro, force, field, rows, variance, reference is not None, learned, tuning, out)
     used, disturbed, accelerometer = out[3].T
     return AttitudeState(q, mean, P, kept), AttitudeRun(out[0], out[1], out[2], used, disturbed, accelerometer)

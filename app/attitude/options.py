@@ -128,8 +128,8 @@ def tuning_of(options: AttitudeOptions) -> Tuning:
         o.accelerometer_noise_m_per_s_sqrt_s, o.accelerometer_m_per_s2, o.accelerometer_correlation_s,
         o.accelerometer_gate, o.gravity_m_per_s2, o.magnetometer_uT, o.field_uT, o.field_correlation_s,
         o.field_walk_uT_per_sqrt_s, o.hard_iron_uT, o.hard_iron_walk_uT_per_sqrt_s, o.learn_hard_iron,
-        o.weigh_disturbances, o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s, o.rest_detection,
-        o.rest_gyro_rad_per_s, o.rest_accelerometer_m_per_s2, o.rest_after_s, o.rest_rate_rad_per_s,
+        o.weigh_disturbances, o.magnetometer_delay_s, o.magnetometer_gate, o.disturbed_uT, o.disturbance_memory_s,
+        o.rest_detection, o.rest_gyro_rad_per_s, o.rest_accelerometer_m_per_s2, o.rest_after_s, o.rest_rate_rad_per_s,
         o.rest_largest_bias_rad_per_s, o.recovery_s, o.new_field_s,
     )  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from app.attitude import kernel as K
+from app.attitude import layout as K
 from app.attitude.options import Tuning
 from app.geometry import Array
 

@@ -35,7 +35,8 @@ def smooth_attitude(
     P, Q = ahead.covariance_rad2, back.covariance_rad2[::-1]
     share = P @ np.linalg.inv(P + Q)
     joined = first * Rotation.from_rotvec(np.einsum("nij,nj->ni", share, (first.inv() * second).as_rotvec()))
-    bias = 0.5 * (ahead.gyro_bias_rad_per_s - back.gyro_bias_rad_per_s[::-1])
+    read = np.linspace(0.0, 1.0, len(samples))[:, None]  # a bias counts by how much of the log its filter has read
+    bias = read * ahead.gyro_bias_rad_per_s - (1.0 - read) * back.gyro_bias_rad_per_s[::-1]
     lead = options.gyro_delay_s * np.nan_to_num(samples.gyro_rad_per_s - bias)
     q = (joined * Rotation.from_rotvec(lead)).as_quat(scalar_first=True)
     both = [getattr(ahead, name) & getattr(back, name)[::-1] for name in ("magnetometer_used", "accelerometer_used")]

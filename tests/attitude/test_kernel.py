@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from app.attitude import kernel
+from app.attitude import layout
 from app.attitude.mekf import begin, follow_attitude
 from app.attitude.options import AttitudeOptions, InertialSamples, tuning_of
 from app.attitude.plain_kernel import PlainFilter, cross_matrix
@@ -96,7 +96,7 @@ def test_small_errors_of_a_still_body_follow_the_linear_kalman_filter() -> None:
     state = begin(samples, None, options)
     start = state.q_body_to_building.copy()
     end, run = follow_attitude(state, samples, None, options)
-    g = state.kept[kernel.GRAVITY]
+    g = state.kept[layout.GRAVITY]
     F = np.array([[1.0, -dt], [0.0, 1.0]])
     v, u = options.gyro_noise_rad_per_sqrt_s**2, options.gyro_bias_walk_rad_per_s_sqrt_s**2
     Q = np.array([[v * dt + u * dt**3 / 3, -u * dt**2 / 2], [-u * dt**2 / 2, u * dt]])

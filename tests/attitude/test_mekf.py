@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from app.attitude import kernel
+from app.attitude import layout
 from app.attitude.mekf import AttitudeRun, AttitudeState, begin, follow_attitude
 from app.attitude.options import AttitudeOptions, InertialSamples
 from app.attitude.reference import MagneticReference, constant_reference, learned_reference, level_reference
@@ -72,7 +73,7 @@ def test_chunks_give_the_same_bits(tumble: Callable, cuts: list[int]) -> None:
     whole_state, whole = follow_attitude(start, samples, reference)
     bounds = [0, *sorted(cuts), 900]
     state, parts = start, []
-    for a, b in zip(bounds, bounds[1:], strict=False):
+    for a, b in pairwise(bounds):
         state, run = follow_attitude(state, _cut(samples, a, b), reference)
         parts.append(run)
     for name in AttitudeRun.__dataclass_fields__:
@@ -117,7 +118,7 @@ def test_a_wrong_start_is_honest_until_it_is_mended(tumble: Callable) -> None:
 @pytest.mark.parametrize("translation", ["bounded", "ignored"])
 @pytest.mark.parametrize("axis", [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
 def test_half_a_turn_of_error_is_recovered_from(tumble: Callable, translation: str, axis: list[float]) -> None:
-    """Confident and 180 degrees wrong, where the innovation has no slope: gates reject, then the sensors are believed."""
+    """Confident and 180 degrees wrong, where the innovation has no slope: gates reject, then believe again."""
     tumbled = tumble(seed=8, sway_m=0.02)
     options = replace(WHITE, translation=translation)  # type: ignore[arg-type]
     reference = constant_reference(tumbled.field_uT)
@@ -128,7 +129,7 @@ def test_half_a_turn_of_error_is_recovered_from(tumble: Callable, translation: s
         state.q_body_to_building, scalar_first=True
     )
     kept = state.kept.copy()
-    kept[kernel.SUM_WEIGHT :] = 0.0  # what was summed in the frame that is now forgotten
+    kept[layout.SUM_WEIGHT :] = 0.0  # what was summed in the frame that is now forgotten
     wrong = replace(state, q_body_to_building=half.as_quat(scalar_first=True), kept=kept)
     _, run = follow_attitude(wrong, _cut(tumbled.samples, 500, 4000), reference, options)
     truth = Rotation.from_quat(tumbled.truth[500:], scalar_first=True)
