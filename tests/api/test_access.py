@@ -4,12 +4,13 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.routing import APIRoute
 
 OPEN = {"/healthz", "/readyz"}
 LOCATING = ("/locate", "/locate:batch", "/replay")
-TRACKS = "/v1/tracks"
+OF_DEVICES = ("/v1/tracks", "/v1/calibrations", "/v1/attitudes", "/v1/reference-field")
 OUTLINE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 5], [0, 5], [0, 0]]]}
 BODIES: dict[str, Any] = {
     "/v1/buildings/{building_id}/floors": {"name": "x", "ordinal": 1},
@@ -21,6 +22,13 @@ BODIES: dict[str, Any] = {
     "/v1/buildings/{building_id}": {},
     "/v1/floors/{floor_id}": {},
     "/v1/tracks/{track_id}/steps": {"steps": [{"number": 0, "t_s": 0.0}]},
+    "/v1/calibrations": {"device": "x", "reference": {"magnitude_ut": 50.0}, "b_ut": [[50.0, 0.0, 0.0]] * 2},
+    "/v1/attitudes": {
+        "t_s": [0.0, 0.1],
+        "gyro_rad_per_s": [[0, 0, 0]] * 2,
+        "accelerometer_m_per_s2": [[0, 0, 9.8]] * 2,
+        "reference": {"kind": "none"},
+    },
 }
 WINDOW = {"window": {"frame": "norm", "b_ut": [50.0], "displacement_m": [[0, 0, 0]]}}
 QUERIES = {
@@ -39,7 +47,13 @@ def ids(service: Any, building: str, mapped_floor: str, active_map: str) -> dict
     survey = service.http.get(f"/v1/floors/{mapped_floor}/surveys").json()["items"][0]["id"]
     job = service.http.get("/v1/jobs", params={"floor_id": mapped_floor}).json()["items"][0]["id"]
     track = service.http.post("/v1/tracks", json={"floor_ids": [mapped_floor], "frame": "norm"}).json()["id"]
+    readings = [[50.0 * float(c) for c in row] for row in _sphere(200)]
+    calibration = service.http.post(
+        "/v1/calibrations",
+        json={"device": "phone", "method": "ellipsoid", "reference": {"magnitude_ut": 50.0}, "b_ut": readings},
+    ).json()["id"]
     return {
+        "calibration_id": calibration,
         "track_id": track,
         "building_id": building,
         "floor_id": mapped_floor,
@@ -47,6 +61,13 @@ def ids(service: Any, building: str, mapped_floor: str, active_map: str) -> dict
         "survey_id": survey,
         "job_id": job,
     }
+
+
+def _sphere(n: int) -> np.ndarray:
+    """Directions all over the sphere, not quite of one length."""
+    rng = np.random.default_rng(0)
+    v = rng.normal(size=(n, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True) + rng.normal(0, 0.001, (n, 3))
 
 
 def _call(http: Any, method: str, path: str, ids: dict[str, str], headers: dict[str, str]) -> Any:
@@ -75,7 +96,7 @@ def test_every_object_of_another_organisation_is_not_found(
 
 
 def test_lists_of_another_organisation_are_empty(service: Any, ids: dict[str, str], stranger: dict[str, str]) -> None:
-    for path in ("/v1/buildings", "/v1/jobs", "/v1/tracks"):
+    for path in ("/v1/buildings", "/v1/jobs", "/v1/tracks", "/v1/calibrations"):
         assert service.http.get(path).json()["items"]
         assert service.http.get(path, headers=stranger).json()["items"] == []
 
@@ -96,9 +117,9 @@ def test_a_key_does_only_what_its_scopes_say(
         if path in OPEN:
             continue
         answer = _call(service.http, method, path, ids, locating)
-        may = path.endswith(LOCATING) or path.startswith(TRACKS)
+        may = path.endswith(LOCATING) or path.startswith(OF_DEVICES)
         assert (answer.status_code != 403) == may, (method, path, answer.text)
-        if method != "GET" and not path.endswith("/field"):
+        if method != "GET" and not path.endswith(("/field", "/attitudes")):
             assert _call(service.http, method, path, ids, reading).status_code == 403, (method, path)
 
 
