@@ -76,3 +76,28 @@ def test_a_map_is_built_on_request_with_its_progress_seen_by_everybody(seat, tow
     you.tab("Maps")
     expect(you.page.locator("#jobs .item").first).to_be_visible(timeout=30_000)
     expect(me.page.locator("#jobs .badge").first).to_have_text("successful", timeout=120_000)
+
+
+@pytest.mark.slow
+def test_a_disturbed_stretch_is_told_and_left_out(seat, town):
+    """A motor of 30 uT is switched on for some seconds while the survey is walked."""
+    floor = town.floors[1]
+    lines = gzip.decompress(town.world.floors[1].surveys[1].gzipped).decode().splitlines()
+    rows = [[float(value) for value in line.split(",")] for line in lines[1:901]]
+    for row in rows[400:480]:
+        row[4:7] = [row[4] + 20.0, row[5] - 15.0, row[6] + 17.0]
+    data = "\n".join([lines[0], *(",".join(f"{value:.5f}" for value in row) for row in rows)])
+    me = seat().open(f"?floor={floor}")
+    me.tab("Surveys")
+    me.drop("#survey-drop", "motor.csv", data.encode())
+    uploads = me.page.locator("#uploads")
+    expect(uploads).to_contain_text("The field was disturbed", timeout=60_000)
+    expect(uploads).to_contain_text("uT and back")
+    uploads.get_by_role("button", name="Leave these stretches out of maps").click()
+    expect(uploads).to_contain_text("left out of maps", timeout=30_000)
+    survey = next(s for s in town.api.get(f"/v1/floors/{floor}/surveys").json()["items"] if s["name"] == "motor.csv")
+    (start, end), *_ = survey["excluded_s"]
+    assert start <= rows[400][0]
+    assert end >= rows[479][0]
+    me.tab("Maps")
+    expect(me.page.locator("#jobs .badge").first).to_have_text("successful", timeout=120_000)

@@ -41,9 +41,34 @@ async function reportOf(id) {
   const warnings = (report.warnings ?? []).map((w) => told(String(w), "warn"));
   const facts = Object.entries(report).filter(([, v]) => ["string", "number", "boolean"].includes(typeof v));
   const assumed = (report.assumptions ?? []).map((a) => make("li", {}, String(a)));
-  return make("div", {}, ...warnings, make("details", {}, make("summary", {}, "What was read"),
+  return make("div", {}, ...warnings, await disturbancesOf(id), make("details", {}, make("summary", {}, "What was read"),
     assumed.length ? make("ul", {}, ...assumed) : null,
     table(["", ""], facts.map(([name, value]) => [name.replaceAll("_", " "), typeof value === "number" ? number(value, 5) : String(value)]))));
+}
+
+/** Stretches over which the field was disturbed, with what leaves them out of maps; nothing where there are none. */
+async function disturbancesOf(id) {
+  const { stretches, excluded_s: left } = await ask("GET", `v1/surveys/${id}/disturbances`);
+  if (!stretches.length && !left.length) return null;
+  const said = make("div");
+  const change = (label, json) => {
+    const button = make("button", { type: "button" }, label);
+    button.addEventListener("click", async () => {
+      try {
+        const { excluded_s: now, job } = await ask("PATCH", `v1/surveys/${id}`, { json });
+        put(said, told(now.length ? `${now.length} stretches are left out of maps.` : "All of it is in maps again.", "good"));
+        if (job) maps.watch(job);
+      } catch (error) {
+        put(said, told(error));
+      }
+    });
+    return button;
+  };
+  return make("div", {},
+    make("p", {}, stretches.length ? "The field was disturbed:" : "No stretch is disturbed any more."),
+    make("ul", {}, ...stretches.map((s) => make("li", {}, `${number(s.start_s, 4)} to ${number(s.end_s, 4)} s: ${s.reason}`))),
+    may("survey:write") && stretches.length ? change("Leave these stretches out of maps", { exclude_disturbed: true }) : null,
+    may("survey:write") && left.length ? change("Take all in again", { excluded_s: [] }) : null, said);
 }
 
 export async function refresh() {
