@@ -9,7 +9,7 @@ their own and a soft iron that stretches the field by 10 % along some axis. Each
 Then all are located in windows of 5 m on other walks, level, heading unknown, both floors candidates, beside the same
 phone without any iron (perfect) and the same phone as it is (raw, default options).
 
-    python benchmarks/map_aided_calibration.py --buildings 3 --phones 6     exits 1 unless with positions known, and
+    python benchmarks/map_aided_calibration.py --buildings 3 --phones 4     exits 1 unless with positions known, and
                                                                             unknown, the median error is within 20 % of
                                                                             the perfect phone's
 """
@@ -91,8 +91,8 @@ def error_m(asked: Window, floors: list[SearchableFloor], floor: int, place_m: n
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--buildings", type=int, default=3)
-    parser.add_argument("--phones", type=int, default=6, help="per building")
-    parser.add_argument("--windows", type=int, default=8, help="per phone")
+    parser.add_argument("--phones", type=int, default=4, help="per building")
+    parser.add_argument("--windows", type=int, default=30, help="per phone")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     warm_up()

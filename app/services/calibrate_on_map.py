@@ -1,8 +1,8 @@
 """Calibrate a phone by walking through a mapped building, without being told where.
 
-A search that integrates a constant offset of the sensor out finds where a walk of some length went, however magnetised
-the phone; the map along that way then tells what the sensor makes of the field, and with the sensor known the way is
-found better. Two or three rounds settle it.
+The turns of a walk tell the sensor's offset roughly, whatever the building. A search that integrates the rest of it out
+finds where the walk went; the map along that way then tells what the sensor makes of the field, and with the sensor
+known the way is found better. Two or three rounds settle it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from app.calibration.fit import CalibrationFit
 from app.calibration.map_aided import map_aided
+from app.calibration.sensor_model import SensorModel
 from app.errors import Fault, InvalidInput
 from app.field.grid import FieldGrid
 from app.geometry import Array, yaw_matrix
@@ -22,7 +23,9 @@ from app.positioning.fix import Fix, LocateOptions
 from app.positioning.locate import SearchableFloor, locate_and_explain
 from app.positioning.window import Window
 
-__all__ = ["CalibratedOnMap", "Way", "calibrate_along", "calibrate_on_map", "with_sensor", "way_of"]
+__all__ = [
+    "CalibratedOnMap", "Way", "calibrate_on_map", "calibrate_along", "offset_by_turns", "way_of", "with_sensor",
+]  # fmt: skip
 
 ROUNDS = 3
 LEFT_UT = 1.0
@@ -36,6 +39,8 @@ turns, alike over a whole leg; with less, a walk off the map explains it better 
 SPACING_M = 1.0
 """Samples of the first search are this far apart: what an unknown distortion does is no noise that a mean would lessen.
 """
+EARTH_UT, STEEL_UT, STEEL_M = 20.0, 5.0, 3.0
+"""Sds of the horizontal field in an unknown direction and of what a building's steel adds, and how far that goes on."""
 LEAST_SHARE = 0.5
 """Of the walk that must be where something is mapped."""
 
@@ -82,8 +87,12 @@ def calibrate_on_map(
     turn = _device_to_frame(window)
     window = replace(window, yaw_rad=_device_yaw_rad(turn))  # so that the heading found is the device's
     distorted_uT = DISTORTED * soft_iron_sd * _turning_uT(turn, floors)
-    asked = replace(_thinned(window), noise_uT=float(np.hypot(window.noise_uT, distorted_uT)))
-    bias_sd_uT = hard_iron_sd_uT
+    vertical_uT = float(np.median([floor.grid.ambient_uT[2] for floor in floors]))
+    offset_uT, bias_sd_uT = offset_by_turns(window, turn, vertical_uT, hard_iron_sd_uT)
+    asked = replace(
+        _thinned(with_sensor(window, turn, SensorModel(offset_uT, np.eye(3)))),
+        noise_uT=float(np.hypot(window.noise_uT, distorted_uT)),
+    )
     for _ in range(rounds):
         fix, explained = locate_and_explain(asked, floors, options=replace(options, bias_sd_uT=bias_sd_uT))
         if explained is None or fix.posterior is None:
@@ -92,8 +101,28 @@ def calibrate_on_map(
         floor = next(each for each in floors if each.floor_id == place.floor_id)
         way = way_of(window, turn, place, fix.posterior.covariance_m2)
         fit = calibrate_along(window, turn, way, floor.grid, hard_iron_sd_uT=hard_iron_sd_uT, soft_iron_sd=soft_iron_sd)
-        asked, bias_sd_uT = with_sensor(window, turn, fit), LEFT_UT
+        asked, bias_sd_uT = with_sensor(window, turn, fit.model), LEFT_UT
     return CalibratedOnMap(fit, asked, way, place.floor_id, fix)
+
+
+def offset_by_turns(
+    window: Window, device_to_frame: Array, vertical_uT: float, hard_iron_sd_uT: float
+) -> tuple[Array, float]:
+    """A first hard iron (3,) uT, with the largest sd it has in any direction, from the turns of a walk alone.
+
+    Of readings turned to the frame, a field that is constant but for what steel does stays, and the sensor's offset
+    goes round: least squares tells them apart, where the device turned. The vertical is taken to be the map's.
+    """
+    y = np.asarray(window.B_uT, dtype=np.float64).ravel()
+    design = np.concatenate([np.broadcast_to(np.eye(3), device_to_frame.shape), device_to_frame], axis=2).reshape(-1, 6)
+    walked_m = float(_path_m(np.asarray(window.displacement_m, dtype=np.float64))[-1])
+    independent = max(1.0, walked_m / STEEL_M) / len(window.B_uT)
+    prior_sd = np.array([EARTH_UT, EARTH_UT, STEEL_UT, *np.full(3, hard_iron_sd_uT)])
+    covariance = np.linalg.inv(design.T @ design * independent / STEEL_UT**2 + np.diag(prior_sd**-2.0))
+    mean = np.array([0.0, 0.0, vertical_uT, 0.0, 0.0, 0.0])
+    right = design.T @ (y - design @ mean) * independent / STEEL_UT**2
+    found = covariance @ right
+    return np.asarray(found[3:]), float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
 
 
 def _device_yaw_rad(device_to_frame: Array) -> Array:
@@ -152,10 +181,10 @@ def way_of(window: Window, device_to_frame: Array, place: ExplainedPlace, covari
     )
 
 
-def with_sensor(window: Window, device_to_frame: Array, fit: CalibrationFit) -> Window:
-    """The window as a calibrated sensor would have told it."""
+def with_sensor(window: Window, device_to_frame: Array, model: SensorModel) -> Window:
+    """The window as that sensor, calibrated, would have told it."""
     body = np.einsum("nji,nj->ni", device_to_frame, window.B_uT)
-    return replace(window, B_uT=np.einsum("nij,nj->ni", device_to_frame, fit.model.apply(body)))
+    return replace(window, B_uT=np.einsum("nij,nj->ni", device_to_frame, model.apply(body)))
 
 
 def _thinned(window: Window) -> Window:
