@@ -18,6 +18,7 @@ from app.attitude.layout import (
     BLAME_UT,
     BLAMED_UT,
     DISTURBANCE,
+    FIELD,
     IRON,
     LEAST_SPREAD,
     MEAN_RESIDUAL,
@@ -58,7 +59,7 @@ def watch_disturbance(x, k, R, z, m, S, dt, s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def blame_device(x, P, k, R, z, dt, s):  # type: ignore[no-untyped-def]
+def blame_device(x, P, k, R, z, learned, dt, s):  # type: ignore[no-untyped-def]
     """Learn the hard iron anew where it explains what was read lately.
 
     Least squares of R z = m + R h over the last seconds, by sums that fade: a magnet on the device turns with it, one
@@ -109,3 +110,20 @@ def blame_device(x, P, k, R, z, dt, s):  # type: ignore[no-untyped-def]
         k[DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
         for i in range(3):
             x[IRON - BIAS + i], P[IRON + i, IRON + i] = iron[i], BLAMED_UT**2
+        if learned:
+            _mend_field(x, P, k, iron)
+
+
+@njit(cache=True, nogil=True)
+def _mend_field(x, P, k, iron):  # type: ignore[no-untyped-def]
+    """The field that goes with this hard iron (3,), where the one learned was learned with another."""
+    field, off = empty(3), 0.0
+    for i in range(3):
+        field[i] = k[SUM_FIELD + i] / k[SUM_WEIGHT]
+        for j in range(3):
+            field[i] -= k[SUM_R + 3 * i + j] / k[SUM_WEIGHT] * iron[j]
+        off += (field[i] - x[FIELD - BIAS + i]) ** 2 / 3.0
+    if off > BLAME_UT**2:
+        forget(P, FIELD)
+        for i in range(3):
+            x[FIELD - BIAS + i], P[FIELD + i, FIELD + i] = field[i], BLAMED_UT**2
