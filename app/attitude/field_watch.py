@@ -22,6 +22,8 @@ from app.attitude.layout import (
     IRON,
     LEAST_SPREAD,
     MEAN_RESIDUAL,
+    MEND_S,
+    MENDING_S,
     RESIDUAL_MEAN_S,
     SUM_FIELD,
     SUM_IRON,
@@ -103,15 +105,22 @@ def blame_device(x, P, k, R, z, learned, dt, s):  # type: ignore[no-untyped-def]
         off += miss * miss / 3.0
         for j in range(3):
             explained += miss * information[i, j] * (iron[j] - x[IRON - BIAS + j])
-    if spread < BLAME_SPREAD or scatter < BLAME_UT**2 or explained < BLAME_SHARE * scatter:
+    k[MENDING_S] = max(0.0, k[MENDING_S] - dt)
+    if spread < BLAME_SPREAD:
         return
-    if off > BLAMED_UT**2:
-        forget(P, IRON)
+    if scatter > BLAME_UT**2 and explained > BLAME_SHARE * scatter and off > BLAMED_UT**2:
+        _set_iron(x, P, iron)
         k[DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
-        for i in range(3):
-            x[IRON - BIAS + i], P[IRON + i, IRON + i] = iron[i], BLAMED_UT**2
-        if learned:
-            _mend_field(x, P, k, iron)
+        k[MENDING_S] = MEND_S
+    if learned and k[MENDING_S] > 0.0 and scatter - explained < 3.0 * BLAMED_UT**2:
+        _mend_field(x, P, k, iron)
+
+
+@njit(cache=True, nogil=True)
+def _set_iron(x, P, iron):  # type: ignore[no-untyped-def]
+    forget(P, IRON)
+    for i in range(3):
+        x[IRON - BIAS + i], P[IRON + i, IRON + i] = iron[i], BLAMED_UT**2
 
 
 @njit(cache=True, nogil=True)
@@ -124,6 +133,8 @@ def _mend_field(x, P, k, iron):  # type: ignore[no-untyped-def]
             field[i] -= k[SUM_R + 3 * i + j] / k[SUM_WEIGHT] * iron[j]
         off += (field[i] - x[FIELD - BIAS + i]) ** 2 / 3.0
     if off > BLAME_UT**2:
+        k[MENDING_S] = 0.0
+        _set_iron(x, P, iron)
         forget(P, FIELD)
         for i in range(3):
             x[FIELD - BIAS + i], P[FIELD + i, FIELD + i] = field[i], BLAMED_UT**2

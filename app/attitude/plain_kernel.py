@@ -225,18 +225,24 @@ class PlainFilter:
         b, c = k[K.SUM_FIELD : K.SUM_FIELD + 3] / n, k[K.SUM_IRON : K.SUM_IRON + 3] / n
         G = k[K.SUM_R : K.SUM_R + 9].reshape(3, 3) / n
         information, right = np.eye(3) * (1.0 + K.LEAST_SPREAD) - G.T @ G, c - G.T @ b
-        iron, now = np.linalg.solve(information, right), self.x[IR]
+        iron, now = np.linalg.solve(information, right), self.x[IR].copy()
         scatter = k[K.SUM_POWER] / n - b @ b - 3.0 * s.reading**2 - 2.0 * now @ right + now @ information @ now
         explained = (iron - now) @ information @ (iron - now)
         spread = 1.0 - np.sum(G * G) / 3.0
-        if spread < K.BLAME_SPREAD or scatter < K.BLAME_UT**2 or explained < K.BLAME_SHARE * scatter:
+        k[K.MENDING_S] = max(0.0, k[K.MENDING_S] - dt)
+        if spread < K.BLAME_SPREAD:
             return
-        if np.mean((iron - now) ** 2) > K.BLAMED_UT**2:
+        blamed = scatter > K.BLAME_UT**2 and explained > K.BLAME_SHARE * scatter
+        if blamed and np.mean((iron - now) ** 2) > K.BLAMED_UT**2:
             self._set_block(IR, iron, K.BLAMED_UT**2)
             k[K.DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
-            field = b - G @ iron
-            if learned and np.mean((field - self.x[FI]) ** 2) > K.BLAME_UT**2:
-                self._set_block(FI, field, K.BLAMED_UT**2)
+            k[K.MENDING_S] = K.MEND_S
+        field = b - G @ iron
+        doubted = learned and k[K.MENDING_S] > 0.0 and scatter - explained < 3.0 * K.BLAMED_UT**2
+        if doubted and np.mean((field - self.x[FI]) ** 2) > K.BLAME_UT**2:
+            k[K.MENDING_S] = 0.0
+            self._set_block(IR, iron, K.BLAMED_UT**2)
+            self._set_block(FI, field, K.BLAMED_UT**2)
 
     def _keep_north(self) -> None:
         (mx, my, _), k, g = self.x[FI], self.k, np.zeros(K.SIZE)
