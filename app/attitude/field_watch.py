@@ -18,9 +18,12 @@ from app.attitude.layout import (
     BLAME_UT,
     BLAMED_UT,
     DISTURBANCE,
+    FIELD,
     IRON,
     LEAST_SPREAD,
     MEAN_RESIDUAL,
+    MEND_S,
+    MENDING_S,
     RESIDUAL_MEAN_S,
     SUM_FIELD,
     SUM_IRON,
@@ -58,7 +61,7 @@ def watch_disturbance(x, k, R, z, m, S, dt, s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def blame_device(x, P, k, R, z, dt, s):  # type: ignore[no-untyped-def]
+def blame_device(x, P, k, R, z, learned, dt, s):  # type: ignore[no-untyped-def]
     """Learn the hard iron anew where it explains what was read lately.
 
     Least squares of R z = m + R h over the last seconds, by sums that fade: a magnet on the device turns with it, one
@@ -102,10 +105,36 @@ def blame_device(x, P, k, R, z, dt, s):  # type: ignore[no-untyped-def]
         off += miss * miss / 3.0
         for j in range(3):
             explained += miss * information[i, j] * (iron[j] - x[IRON - BIAS + j])
-    if spread < BLAME_SPREAD or scatter < BLAME_UT**2 or explained < BLAME_SHARE * scatter:
+    k[MENDING_S] = max(0.0, k[MENDING_S] - dt)
+    if spread < BLAME_SPREAD:
         return
-    if off > BLAMED_UT**2:
-        forget(P, IRON)
+    if scatter > BLAME_UT**2 and explained > BLAME_SHARE * scatter and off > BLAMED_UT**2:
+        _set_iron(x, P, iron)
         k[DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
+        k[MENDING_S] = MEND_S
+    if learned and k[MENDING_S] > 0.0 and scatter - explained < 3.0 * BLAMED_UT**2:
+        _mend_field(x, P, k, iron)
+
+
+@njit(cache=True, nogil=True)
+def _set_iron(x, P, iron):  # type: ignore[no-untyped-def]
+    forget(P, IRON)
+    for i in range(3):
+        x[IRON - BIAS + i], P[IRON + i, IRON + i] = iron[i], BLAMED_UT**2
+
+
+@njit(cache=True, nogil=True)
+def _mend_field(x, P, k, iron):  # type: ignore[no-untyped-def]
+    """The field that goes with this hard iron (3,), where the one learned was learned with another."""
+    field, off = empty(3), 0.0
+    for i in range(3):
+        field[i] = k[SUM_FIELD + i] / k[SUM_WEIGHT]
+        for j in range(3):
+            field[i] -= k[SUM_R + 3 * i + j] / k[SUM_WEIGHT] * iron[j]
+        off += (field[i] - x[FIELD - BIAS + i]) ** 2 / 3.0
+    if off > BLAME_UT**2:
+        k[MENDING_S] = 0.0
+        _set_iron(x, P, iron)
+        forget(P, FIELD)
         for i in range(3):
-            x[IRON - BIAS + i], P[IRON + i, IRON + i] = iron[i], BLAMED_UT**2
+            x[FIELD - BIAS + i], P[FIELD + i, FIELD + i] = field[i], BLAMED_UT**2

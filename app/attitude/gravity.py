@@ -14,7 +14,6 @@ from app.attitude.layout import (
     BIAS,
     FORCE_REJECTED_S,
     GRAVITY,
-    KEPT,
     MEAN_FORCE,
     MEAN_GYRO,
     NORTH_SET,
@@ -24,6 +23,7 @@ from app.attitude.layout import (
     REST_SPEED_M_S,
     SIZE,
     STILL_S,
+    SUM_END,
     SUM_WEIGHT,
     VELOCITY,
 )
@@ -55,7 +55,7 @@ def _level(q, P, k, force, sd):  # type: ignore[no-untyped-def]
     advance(q, turn[0], turn[1], turn[2])
     building_from_body(q, R)
     forget(P, ANGLE)
-    k[SUM_WEIGHT:KEPT] = 0.0
+    k[SUM_WEIGHT:SUM_END] = 0.0
     for i in range(3):
         for j in range(3):
             P[i, j] = sd * sd * (R[0, i] * R[0, j] + R[1, i] * R[1, j]) + yaw * R[2, i] * R[2, j]

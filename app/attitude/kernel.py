@@ -10,7 +10,7 @@ first guess of either.
 """
 
 from numba import njit
-from numpy import empty, exp, isfinite, zeros
+from numpy import empty, exp, isfinite, nan, zeros
 
 from app.attitude.correction import cross_into, forget, measure
 from app.attitude.error_dynamics import advance, bias_response, building_from_body, process_noise, turn_back
@@ -20,6 +20,8 @@ from app.attitude.joseph import innovation_covariance, squared_distance
 from app.attitude.layout import (
     ANGLE,
     BIAS,
+    DECLINATION,
+    DECLINATION_RAD2,
     DISTURBANCE,
     FIELD,
     FORCE_REJECTED_S,
@@ -30,6 +32,7 @@ from app.attitude.layout import (
     LOST_RAD2,
     MAG_REJECTED_S,
     MEAN_FORCE,
+    NORTH,
     NORTH_SET,
     REST_MEAN_S,
     SIZE,
@@ -40,7 +43,7 @@ from app.attitude.layout import (
     VELOCITY,
     T,
 )
-from app.attitude.north import set_north, tell
+from app.attitude.north import keep_north, set_north, tell
 
 __all__ = ["run"]
 
@@ -90,7 +93,7 @@ def _predict(q, x, P, k, dt, rate, force, has_force, s):  # type: ignore[no-unty
         turned = (s.unknown_rate * (dt - s.gyro_gap)) ** 2
         wrong += turned
         if turned > LOST_RAD2:  # too wrong for small angles: the next readings set the attitude anew
-            k[FORCE_REJECTED_S], k[NORTH_SET] = -1.0, 0.0
+            k[FORCE_REJECTED_S], k[NORTH_SET], k[NORTH], k[DECLINATION], k[DECLINATION_RAD2] = -1.0, 0.0, nan, 0.0, 0.0
     for i in range(3):
         P[i, i] += noise[0] + wrong
         P[i, BIAS + i] += noise[1]
@@ -112,11 +115,11 @@ def _heed_magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s
     """The field, known or learned; whether it was believed."""
     R, m = empty((3, 3)), empty(3)
     H, HP, S, noise, r = zeros((3, SIZE)), empty((3, SIZE)), empty((3, 3)), zeros((3, 3)), empty(3)
-    for i in range(3):
-        m[i] = x[FIELD - BIAS + i] if learned else reference[i]
     building_from_body(q, R)
     if s.learn_hard_iron:
-        blame_device(x, P, k, R, z, dt, s)
+        blame_device(x, P, k, R, z, learned, dt, s)
+    for i in range(3):
+        m[i] = x[FIELD - BIAS + i] if learned else reference[i]
     if k[NORTH_SET] < 1.0:
         set_north(q, x, P, k, R, z, m, variance, learned, dt, s)
         return True
@@ -154,7 +157,9 @@ def _heed_magnetometer(q, x, P, k, z, reference, variance, learned, rate2, dt, s
         disturbed = k[DISTURBANCE] > s.disturbed**2
         k[MAG_REJECTED_S] += dt * ((s.recovery / s.new_field if learned else 0.0) if disturbed else 1.0)
         if k[MAG_REJECTED_S] > s.recovery:
-            k[MAG_REJECTED_S], k[NORTH_SET] = 0.0, 0.0  # the next reading sets it anew
+            k[MAG_REJECTED_S], k[NORTH_SET] = 0.0, 0.0  # the next readings set it anew
+            if learned:
+                keep_north(q, x, P, k)
     return believed
 
 

@@ -116,7 +116,7 @@ def begin(
            options.hard_iron_uT]  # fmt: skip
     P[3:, 3:] = np.diag(np.square(np.repeat(sds, 3)))
     kept = np.zeros(layout.KEPT)
-    kept[[layout.T, layout.T_GYRO, layout.T_FORCE, layout.T_MAG]] = np.nan
+    kept[[layout.T, layout.T_GYRO, layout.T_FORCE, layout.T_MAG, layout.NORTH]] = np.nan
     kept[layout.STILL_S] = kept[layout.DISTURBANCE] = -1.0
     kept[layout.GRAVITY] = size if off < 0.05 else options.gravity_m_per_s2
     return AttitudeState(q, np.zeros(layout.SIZE - 3), P, kept)

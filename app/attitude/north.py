@@ -1,27 +1,30 @@
 """Where north is: yaw or the learned field set from the first readings, and yaw as it is told, compiled."""
 
 from numba import njit
-from numpy import arctan2, cos, empty, sin, sqrt, zeros
+from numpy import arctan2, cos, empty, isfinite, sin, sqrt, zeros
 
 from app.attitude.correction import forget
 from app.attitude.error_dynamics import advance, building_from_body
 from app.attitude.joseph import innovation_covariance
 from app.attitude.layout import (
     BIAS,
+    DECLINATION,
+    DECLINATION_RAD2,
     DISTURBANCE,
     FIELD,
     IRON,
-    KEPT,
     LAST_GYRO,
     MEAN_RESIDUAL,
+    NORTH,
     NORTH_SET,
     NORTH_SET_S,
     SIZE,
+    SUM_END,
     SUM_WEIGHT,
     UNKNOWN_YAW_RAD2,
 )
 
-__all__ = ["set_north", "tell"]
+__all__ = ["keep_north", "set_north", "tell"]
 
 
 @njit(cache=True, nogil=True)
@@ -88,7 +91,23 @@ def _set_yaw(q, x, P, k, z, m, variance):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             P[i, j] = S[i, j] + more * R[2, i] * R[2, j]
-    k[SUM_WEIGHT:KEPT] = 0.0
+    k[SUM_WEIGHT:SUM_END] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def keep_north(q, x, P, k):  # type: ignore[no-untyped-def]
+    """Note where north is, and how well, before the field is learned anew: another place, but north is where it was."""
+    R, g = empty((3, 3)), zeros(SIZE)
+    building_from_body(q, R)
+    mx, my = x[FIELD - BIAS], x[FIELD - BIAS + 1]
+    level2 = max(mx * mx + my * my, 1e-12)
+    k[NORTH] = arctan2(my, mx) - k[DECLINATION]
+    g[FIELD], g[FIELD + 1] = my / level2, -mx / level2
+    for i in range(3):
+        g[i] = R[2, i]
+    for i in range(SIZE):
+        for j in range(SIZE):
+            k[DECLINATION_RAD2] += g[i] * P[i, j] * g[j]
 
 
 @njit(cache=True, nogil=True)
@@ -106,6 +125,8 @@ def set_north(q, x, P, k, R, z, m, variance, learned, dt, s):  # type: ignore[no
             mean[i] += R[j, i] * k[MEAN_RESIDUAL + j]
     if learned:
         _learn_field(q, x, P, mean, sqrt(s.reading**2 + s.field**2))
+        if isfinite(k[NORTH]):
+            k[DECLINATION] = arctan2(x[FIELD - BIAS + 1], x[FIELD - BIAS]) - k[NORTH]
     elif k[NORTH_SET] == 1.0:
         typical = (variance[0, 0] + variance[1, 1] + variance[2, 2]) / 3.0
         _set_yaw(q, x, P, k, mean, m, s.reading**2 + s.field**2 + typical)
@@ -127,14 +148,14 @@ def tell(n, q, x, P, k, learned, lead, out):  # type: ignore[no-untyped-def]
     if learned and k[NORTH_SET] > 0.0:
         mx, my = x[FIELD - BIAS], x[FIELD - BIAS + 1]
         level2 = max(mx * mx + my * my, 1e-12)
-        azimuth = arctan2(my, mx)
+        azimuth = arctan2(my, mx) - k[DECLINATION]
         advance(shown, -azimuth * R[2, 0], -azimuth * R[2, 1], -azimuth * R[2, 2])
         for i in range(3):  # d azimuth = (mx dmy - my dmx) / level2, taken off about the vertical
             J[i, FIELD] = R[2, i] * my / level2
             J[i, FIELD + 1] = -R[2, i] * mx / level2
     JP, S = empty((3, SIZE)), empty((3, 3))
     innovation_covariance(P, J, JP, S)
-    unknown = UNKNOWN_YAW_RAD2 if k[NORTH_SET] < 1.0 else 0.0
+    unknown = UNKNOWN_YAW_RAD2 if k[NORTH_SET] < 1.0 and not isfinite(k[NORTH]) else k[DECLINATION_RAD2]
     for i in range(3):
         out[2][n, i] = x[i]
         for j in range(3):

@@ -35,7 +35,8 @@ class AttitudeOptions:
 
     Gates are chi-square quantiles with three degrees of freedom (14.16: 3 sigma, Brommer L175). A sensor rejected
     without pause for `recovery_s` is believed again: the attitude is set from it. Where the field's strength or dip is
-    wrong too, the fault is the field's: a known one is waited for, a learned one learned anew after `new_field_s`.
+    wrong too, the fault is the field's: a known one is waited for, a learned one learned anew after `new_field_s`,
+    with north where it was.
     """
 
     gyro_noise_rad_per_sqrt_s: float = 1.5e-4

@@ -86,6 +86,7 @@ class PlainFilter:
         wrong = s.gyro_scale**2 * (rate @ rate) * dt + turned
         if turned > K.LOST_RAD2:
             k[K.FORCE_REJECTED_S], k[K.NORTH_SET] = -1.0, 0.0
+            k[K.NORTH], k[K.DECLINATION], k[K.DECLINATION_RAD2] = np.nan, 0.0, 0.0
         v, u, eye = s.gyro_noise**2, s.bias_walk**2, np.eye(3)
         Q = np.zeros((K.SIZE, K.SIZE))
         Q[TH, TH] = (v * dt + u * dt**3 / 3.0 + wrong) * eye
@@ -148,7 +149,7 @@ class PlainFilter:
         yaw = float(self.R[2] @ self.P[TH, TH] @ self.R[2]) * self.k[K.NORTH_SET]
         self.attitude = Rotation.from_rotvec(turn) * self.attitude
         self._set_block(TH, np.zeros(3), 0.0)
-        self.k[K.SUM_WEIGHT :] = 0.0
+        self.k[K.SUM_WEIGHT : K.SUM_END] = 0.0
         self.P[TH, TH] = self.R.T @ np.diag([K.RELEVELLED_RAD**2, K.RELEVELLED_RAD**2, yaw]) @ self.R
 
     def _rest(self, gyro: Array, dt: float) -> None:
@@ -169,7 +170,7 @@ class PlainFilter:
     def _magnetometer(self, z: Array, reference: Array | None, V: Array, dt: float) -> bool:
         s, k, learned = self.s, self.k, reference is None
         if s.learn_hard_iron:
-            self._blame_device(z, dt)
+            self._blame_device(z, learned, dt)
         if k[K.NORTH_SET] < 1.0:
             self._set_north(z, reference, V, dt)
             return True
@@ -190,6 +191,8 @@ class PlainFilter:
             k[K.MAG_REJECTED_S] += dt * (patience if k[K.DISTURBANCE] > s.disturbed**2 else 1.0)
             if k[K.MAG_REJECTED_S] > s.recovery:
                 k[K.MAG_REJECTED_S] = k[K.NORTH_SET] = 0.0
+                if learned:
+                    self._keep_north()
             return False
         k[K.MAG_REJECTED_S] = 0.0
         more = max(1.0, 2.0 * s.field_correlation / dt)
@@ -211,7 +214,7 @@ class PlainFilter:
         beyond = off**2 - np.array([S[2, 2], along @ S @ along]) - s.field**2
         k[K.DISTURBANCE] = max(0.5 * np.maximum(0.0, beyond).sum(), np.exp(-dt / s.memory) * k[K.DISTURBANCE])
 
-    def _blame_device(self, z: Array, dt: float) -> None:
+    def _blame_device(self, z: Array, learned: bool, dt: float) -> None:
         k, s, R, fade = self.k, self.s, self.R, np.exp(-dt / K.BLAME_S)
         for start, new in (
             (K.SUM_WEIGHT, [1.0]), (K.SUM_POWER, [z @ z]), (K.SUM_FIELD, R @ z), (K.SUM_IRON, z), (K.SUM_R, R.ravel()),
@@ -222,15 +225,30 @@ class PlainFilter:
         b, c = k[K.SUM_FIELD : K.SUM_FIELD + 3] / n, k[K.SUM_IRON : K.SUM_IRON + 3] / n
         G = k[K.SUM_R : K.SUM_R + 9].reshape(3, 3) / n
         information, right = np.eye(3) * (1.0 + K.LEAST_SPREAD) - G.T @ G, c - G.T @ b
-        iron, now = np.linalg.solve(information, right), self.x[IR]
+        iron, now = np.linalg.solve(information, right), self.x[IR].copy()
         scatter = k[K.SUM_POWER] / n - b @ b - 3.0 * s.reading**2 - 2.0 * now @ right + now @ information @ now
         explained = (iron - now) @ information @ (iron - now)
         spread = 1.0 - np.sum(G * G) / 3.0
-        if spread < K.BLAME_SPREAD or scatter < K.BLAME_UT**2 or explained < K.BLAME_SHARE * scatter:
+        k[K.MENDING_S] = max(0.0, k[K.MENDING_S] - dt)
+        if spread < K.BLAME_SPREAD:
             return
-        if np.mean((iron - now) ** 2) > K.BLAMED_UT**2:
+        blamed = scatter > K.BLAME_UT**2 and explained > K.BLAME_SHARE * scatter
+        if blamed and np.mean((iron - now) ** 2) > K.BLAMED_UT**2:
             self._set_block(IR, iron, K.BLAMED_UT**2)
             k[K.DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
+            k[K.MENDING_S] = K.MEND_S
+        field = b - G @ iron
+        doubted = learned and k[K.MENDING_S] > 0.0 and scatter - explained < 3.0 * K.BLAMED_UT**2
+        if doubted and np.mean((field - self.x[FI]) ** 2) > K.BLAME_UT**2:
+            k[K.MENDING_S] = 0.0
+            self._set_block(IR, iron, K.BLAMED_UT**2)
+            self._set_block(FI, field, K.BLAMED_UT**2)
+
+    def _keep_north(self) -> None:
+        (mx, my, _), k, g = self.x[FI], self.k, np.zeros(K.SIZE)
+        k[K.NORTH] = np.arctan2(my, mx) - k[K.DECLINATION]
+        g[TH], g[K.FIELD], g[K.FIELD + 1] = self.R[2], my / (mx * mx + my * my), -mx / (mx * mx + my * my)
+        k[K.DECLINATION_RAD2] += g @ self.P @ g
 
     def _set_north(self, z: Array, reference: Array | None, V: Array, dt: float) -> None:
         k, s, R = self.k, self.s, self.R
@@ -247,6 +265,8 @@ class PlainFilter:
             self.P[FI, :] = J @ self.P
             self.P[:, FI] = self.P[FI, :].T
             self.P[FI, FI] = J @ self.P @ J.T + variance * np.eye(3)
+            if np.isfinite(k[K.NORTH]):
+                k[K.DECLINATION] = np.arctan2(self.x[K.FIELD + 1], self.x[K.FIELD]) - k[K.NORTH]
         elif k[K.NORTH_SET] == 1.0:
             self._set_yaw(mean - self.x[IR], reference, variance + float(np.trace(V)) / 3.0)
             k[K.MEAN_RESIDUAL : K.MEAN_RESIDUAL + 3] = reference
@@ -267,7 +287,7 @@ class PlainFilter:
             return
         self.P = T @ self.P @ T.T
         self.P[TH, TH] += more * np.outer(R[2], R[2])
-        self.k[K.SUM_WEIGHT :] = 0.0
+        self.k[K.SUM_WEIGHT : K.SUM_END] = 0.0
 
     def _shown(self, learned: bool) -> tuple[Array, Array]:
         rate = self.k[K.LAST_GYRO : K.LAST_GYRO + 3] - self.x[BI]
@@ -275,11 +295,12 @@ class PlainFilter:
         if learned and self.k[K.NORTH_SET] > 0.0:
             mx, my, _ = self.x[FI]
             R2 = shown.as_matrix()[2]
-            shown = Rotation.from_rotvec(-np.arctan2(my, mx) * UP) * shown
+            shown = Rotation.from_rotvec((self.k[K.DECLINATION] - np.arctan2(my, mx)) * UP) * shown
             J[:, K.FIELD], J[:, K.FIELD + 1] = R2 * my / (mx * mx + my * my), -R2 * mx / (mx * mx + my * my)
         up = shown.as_matrix()[2]
-        unknown = K.UNKNOWN_YAW_RAD2 * (self.k[K.NORTH_SET] < 1.0) * np.outer(up, up)
-        return np.asarray(shown.as_quat(scalar_first=True)), J @ self.P @ J.T + unknown
+        lost = self.k[K.NORTH_SET] < 1.0 and not np.isfinite(self.k[K.NORTH])
+        more = K.UNKNOWN_YAW_RAD2 if lost else self.k[K.DECLINATION_RAD2]
+        return np.asarray(shown.as_quat(scalar_first=True)), J @ self.P @ J.T + more * np.outer(up, up)
 
 
 def _smooth(k: Array, start: int, new: Array, fade: float) -> None:

@@ -129,7 +129,7 @@ def test_half_a_turn_of_error_is_recovered_from(tumble: Callable, translation: s
         state.q_body_to_building, scalar_first=True
     )
     kept = state.kept.copy()
-    kept[layout.SUM_WEIGHT :] = 0.0  # what was summed in the frame that is now forgotten
+    kept[layout.SUM_WEIGHT : layout.SUM_END] = 0.0  # what was summed in the frame that is now forgotten
     wrong = replace(state, q_body_to_building=half.as_quat(scalar_first=True), kept=kept)
     _, run = follow_attitude(wrong, _cut(tumbled.samples, 500, 4000), reference, options)
     truth = Rotation.from_quat(tumbled.truth[500:], scalar_first=True)
