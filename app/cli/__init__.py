@@ -2,7 +2,7 @@
 
 import typer
 
-from app.cli import client, demo, doctor, evaluate, evaluate_tracks, keys, serve, view
+from app.cli import calibrate, client, demo, doctor, evaluate, evaluate_tracks, keys, serve, view
 from app.cli.default_group import DEFAULT, DefaultGroup
 
 __all__ = ["main"]
@@ -18,6 +18,7 @@ main.command()(serve.serve)
 main.command()(serve.worker)
 main.command()(demo.demo)
 main.command()(client.ingest)
+main.command()(calibrate.calibrate)
 main.command()(client.locate)
 main.command()(client.export)
 main.command()(view.view)

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-__all__ = ["Api", "ingest", "locate", "export"]
+__all__ = ["DEFAULT_URL", "Api", "KeyOption", "Url", "export", "ingest", "locate"]
 
 Url = Annotated[str, typer.Option(envvar="ISODYN_URL", help="where the server is")]
 KeyOption = Annotated[str, typer.Option(envvar="ISODYN_KEY", help="an API key, isd_...")]
@@ -52,11 +52,13 @@ def ingest(
     session: Annotated[
         str | None, typer.Option(help="label of the sensor's calibration session, for files with quaternions")
     ] = None,
+    device: Annotated[str | None, typer.Option(help="whose newest calibration is applied to the readings")] = None,
     wait: Annotated[bool, typer.Option(help="wait until the map is built")] = True,
 ) -> None:
     """Upload surveys to a floor, and wait for its map."""
     api = Api(url, key)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    told = {name: value for name, value in (("session", session), ("device", device)) if value}
     job = None
     with Progress(*columns, console=Console(stderr=True)) as progress:
         uploading = progress.add_task("uploading", total=len(files))
@@ -68,7 +70,7 @@ def ingest(
             answer = api.call(
                 "POST",
                 f"/v1/floors/{floor_id}/surveys",
-                params={"format": kind, "frame": frame, "name": file.name} | ({"session": session} if session else {}),
+                params={"format": kind, "frame": frame, "name": file.name} | told,
                 headers={"Content-Encoding": "gzip"},
                 content=file.read_bytes() if packed else gzip.compress(file.read_bytes()),
             ).json()

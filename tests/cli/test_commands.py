@@ -38,6 +38,7 @@ def test_every_command_explains_itself() -> None:
         "worker",
         "demo",
         "ingest",
+        "calibrate",
         "locate",
         "export",
         "view",
