@@ -19,7 +19,7 @@ from app.attitude.sudden_changes import ORDER, Step, find_hum, find_steps, find_
 from app.errors import Fault, InvalidInput
 from app.geometry import Array
 
-__all__ = ["DisturbedStretch", "StretchKind", "disturbed_samples", "find_disturbed_stretches"]
+__all__ = ["DisturbedStretch", "StretchKind", "disturbed_samples", "find_departures", "find_disturbed_stretches"]
 
 StretchKind = Literal["step and back", "step that stays", "step", "hum", "stuck", "standstill", "revisit", "map"]
 
@@ -83,9 +83,13 @@ def find_disturbed_stretches(
         return ()
     found = [*_sudden(t, B), *_slow(t, B, p, attitude_sd_rad if B.shape[1] == 3 else 0.0)]
     if expected is not None:
-        path_m = _path_m(p)
-        found += [_departed(t, each, "map") for each in departures(t, path_m, B, expected)]
+        found += find_departures(t, B, p, expected)
     return _merged(found)
+
+
+def find_departures(t_s: Array, B_uT: Array, p_building_m: Array, expected: Expected) -> list[DisturbedStretch]:
+    """The stretches of kind "map" alone: where readings (n, c) depart from what other surveys lead one to expect."""
+    return [_departed(t_s, each, "map") for each in departures(t_s, _path_m(p_building_m), B_uT, expected)]
 
 
 def disturbed_samples(t_s: Array, stretches: tuple[DisturbedStretch, ...]) -> NDArray[np.bool_]:

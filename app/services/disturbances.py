@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from app.attitude.departures import Expected
-from app.attitude.stretches import DisturbedStretch, find_disturbed_stretches
+from app.attitude.stretches import DisturbedStretch, find_departures, find_disturbed_stretches
 from app.errors import Fault, InvalidInput
 from app.field.error_structure import ErrorStructure
 from app.field.leave_one_out import HeldOut
@@ -19,7 +19,7 @@ from app.geometry import Array
 
 __all__ = ["MOST_JUDGED", "against_others", "by_itself", "checked_stretches", "union_s", "without_stretches"]
 
-MOST_JUDGED = 15_000
+MOST_JUDGED = 8_000
 """Samples of a walk that are looked at one by one: of a longer one, means of neighbours."""
 MOST_STRETCHES = 1000
 
@@ -31,7 +31,7 @@ def by_itself(samples: Samples) -> list[dict[str, Any]]:
     """What the walk shows by itself, as JSON. A level walk, whose frame turns, is judged by its norm."""
     B_uT = samples.B_uT if samples.frame == "building" else np.linalg.norm(samples.B_uT, axis=1, keepdims=True)
     t, B, p = _thinned(samples.t_s, B_uT, samples.p_building_m)
-    return _as_json(t, B, p, None)
+    return _as_json(find_disturbed_stretches(t, B, p))
 
 
 def against_others(
@@ -44,8 +44,7 @@ def against_others(
     mean = np.where(held_out.judged[:, None], B_uT - held_out.error_uT, np.nan)
     sd = np.where(held_out.judged[:, None], held_out.sd_uT, np.nan)
     t, B, p, mean, sd = _thinned(samples.t_s, B_uT, samples.p_building_m, mean, sd)
-    found = _as_json(t, B, p, Expected(mean, sd, structure))
-    return [each for each in found if each["kind"] == "map"]
+    return _as_json(find_departures(t, B, p, Expected(mean, sd, structure)))
 
 
 def without_stretches(samples: Samples, excluded_s: Stretches) -> Samples:
@@ -91,8 +90,7 @@ def _thinned(t_s: Array, *columns: Array) -> tuple[Array, ...]:
     )
 
 
-def _as_json(t_s: Array, B_uT: Array, p_m: Array, expected: Expected | None) -> list[dict[str, Any]]:
-    stretches = find_disturbed_stretches(t_s, B_uT, p_m, expected=expected)
+def _as_json(stretches: Sequence[DisturbedStretch]) -> list[dict[str, Any]]:
     return [_told(each) for each in stretches[:MOST_STRETCHES]]
 
 

@@ -196,7 +196,7 @@ def test_undisturbed_walks_of_a_building_are_called_disturbed_for_less_than_one_
         building = make_building(rng, floors=1, width_m=24.0, depth_m=18.0)
         for _ in range(4):
             hard_iron = tuple(rng.normal(0.0, 0.5, 3))
-            sensor = Magnetometer(0.4, hard_iron, 0.01, 0.03, position_sd_m=0.1)
+            sensor = Magnetometer(0.4, hard_iron, tilt_sd_rad=0.01, yaw_sd_rad=0.03, position_sd_m=0.1)
             samples = survey(building, random_waypoints(building, 0, rng, length_m=200.0), sensor, rng)
             found = find_disturbed_stretches(samples.t_s, samples.B_uT, samples.p_building_m)
             marked += sum(each.end_s - each.start_s for each in found)
