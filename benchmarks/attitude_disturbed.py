@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from attitude_broad import FOLDER, Trial, errors_deg, ours, read_trial, vqf_causal
+from attitude_broad import FOLDER, Trial, errors_deg, missing, ours, read_trial, vqf_causal
 from scipy.spatial.transform import Rotation
 
 IRONS_UT = ([0.0, 0.0, 13.0], [5.0, -3.0, 4.0], [25.0, -10.0, 40.0], [-60.0, 80.0, 90.0])
@@ -71,6 +71,9 @@ def disturbances(trial: Trial, p_m: np.ndarray, rng: np.random.Generator) -> Ite
 def main() -> int:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
     paths = [p for p in sorted(folder.glob("*.hdf5")) if "_magnet_" not in p.stem]
+    if why := missing(folder):
+        print(f"skipped: {why}")
+        return 0
     ratios = []
     for path in paths:
         trial = read_trial(path)

@@ -281,3 +281,5 @@ def test_what_cannot_be_used_is_refused(tumble: Callable) -> None:
         begin(samples, MagneticReference(np.zeros((5, 3))))
     with pytest.raises(InvalidInput, match="not negative"):
         follow_attitude(begin(samples, None), samples, None, AttitudeOptions(field_uT=-1.0))
+    with pytest.raises(InvalidInput, match="no sensor is certain"):
+        follow_attitude(begin(samples, None), samples, None, AttitudeOptions(magnetometer_uT=0.0))
