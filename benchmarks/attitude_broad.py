@@ -15,6 +15,7 @@ last reading, the delay that common gyros state; "VQF ahead" is VQF with the sam
 import os
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,18 @@ def errors_deg(q: np.ndarray, trial: Trial) -> tuple[float, float, float, float]
 
 def _angle(q: np.ndarray) -> np.ndarray:
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(q[:, 0]), 0.0, 1.0)))
+
+
+def missing(folder: Path) -> str:
+    """What this needs and is not there; empty where all is."""
+    lacking = [name for name in ("h5py", "vqf", "ahrs") if find_spec(name) is None]
+    if lacking:
+        return f"pip install {' '.join(lacking)}"
+    return (
+        ""
+        if any(folder.glob("*.hdf5"))
+        else f"no trials in {folder}; get github.com/dlaidig/broad and give its data folder"
+    )
 
 
 def samples_of(trial: Trial) -> InertialSamples:
@@ -133,9 +146,9 @@ WHOLE_LOG = {"ours": ours_whole_log, "VQF": vqf_whole_log}
 def main() -> int:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
     paths = sorted(folder.glob("*.hdf5"))
-    if not paths:
-        print(f"no trials at {folder}: get them from github.com/dlaidig/broad")
-        return 1
+    if why := missing(folder):
+        print(f"skipped: {why}")
+        return 0
     totals: dict[str, dict[str, tuple[float, ...]]] = {}
     for path in paths:
         trial = read_trial(path)

@@ -92,27 +92,27 @@ def blame_device(x, P, k, R, z, learned, dt, s):  # type: ignore[no-untyped-def]
         spread -= information[i, i] - LEAST_SPREAD
     spread = 1.0 - spread / 3.0
     inverse(information, inverted)
-    explained = off = 0.0
+    off, left = 0.0, scatter
     for i in range(3):
         for j in range(3):
             iron[i] += inverted[i, j] * right[j]
+        information[i, i] -= LEAST_SPREAD
+    for i in range(3):
         own = x[IRON - BIAS + i]
+        off += (iron[i] - own) ** 2 / 3.0
         scatter -= 2.0 * own * right[i]
+        left -= 2.0 * iron[i] * right[i]
         for j in range(3):
             scatter += own * information[i, j] * x[IRON - BIAS + j]
-    for i in range(3):
-        miss = iron[i] - x[IRON - BIAS + i]
-        off += miss * miss / 3.0
-        for j in range(3):
-            explained += miss * information[i, j] * (iron[j] - x[IRON - BIAS + j])
+            left += iron[i] * information[i, j] * iron[j]
     k[MENDING_S] = max(0.0, k[MENDING_S] - dt)
     if spread < BLAME_SPREAD:
         return
-    if scatter > BLAME_UT**2 and explained > BLAME_SHARE * scatter and off > BLAMED_UT**2:
+    if scatter > BLAME_UT**2 and scatter - left > BLAME_SHARE * scatter and off > BLAMED_UT**2:
         _set_iron(x, P, iron)
-        k[DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
+        k[DISTURBANCE] *= max(0.0, left / scatter)
         k[MENDING_S] = MEND_S
-    if learned and k[MENDING_S] > 0.0 and scatter - explained < 3.0 * BLAMED_UT**2:
+    if learned and k[MENDING_S] > 0.0 and left < 3.0 * BLAMED_UT**2:
         _mend_field(x, P, k, iron)
 
 
@@ -126,13 +126,14 @@ def _set_iron(x, P, iron):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _mend_field(x, P, k, iron):  # type: ignore[no-untyped-def]
     """The field that goes with this hard iron (3,), where the one learned was learned with another."""
-    field, off = empty(3), 0.0
+    field, off, size = empty(3), 0.0, 0.0
     for i in range(3):
         field[i] = k[SUM_FIELD + i] / k[SUM_WEIGHT]
         for j in range(3):
             field[i] -= k[SUM_R + 3 * i + j] / k[SUM_WEIGHT] * iron[j]
+        size += iron[i] * iron[i] / 3.0
         off += (field[i] - x[FIELD - BIAS + i]) ** 2 / 3.0
-    if off > BLAME_UT**2:
+    if off > BLAME_UT**2 and size > BLAME_UT**2:
         k[MENDING_S] = 0.0
         _set_iron(x, P, iron)
         forget(P, FIELD)

@@ -145,7 +145,7 @@ def tell(n, q, x, P, k, learned, lead, out):  # type: ignore[no-untyped-def]
     building_from_body(shown, R)
     for i in range(3):
         J[i, i] = 1.0
-    if learned and k[NORTH_SET] > 0.0:
+    if learned and (k[NORTH_SET] > 0.0 or isfinite(k[NORTH])):
         mx, my = x[FIELD - BIAS], x[FIELD - BIAS + 1]
         level2 = max(mx * mx + my * my, 1e-12)
         azimuth = arctan2(my, mx) - k[DECLINATION]

@@ -15,6 +15,12 @@ from app.geometry import Array
 __all__ = ["AttitudeOptions", "InertialSamples", "Tuning", "tuning_of"]
 
 
+POSITIVE = (
+    "gyro_noise_rad_per_sqrt_s", "speed_m_per_s", "accelerometer_m_per_s2", "gravity_m_per_s2", "magnetometer_uT",
+    "disturbance_memory_s", "new_field_s",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class AttitudeOptions:
     """Standard deviations per axis, and times; the defaults suit phones and body sensors.
@@ -116,13 +122,16 @@ class Tuning(NamedTuple):
 
 
 def tuning_of(options: AttitudeOptions) -> Tuning:
-    """The same numbers; raises InvalidInput where one is negative or not finite."""
+    """The same numbers; raises InvalidInput where one is negative or not finite, or zero where that means certainty."""
     o = options
     numbers = {name: getattr(o, name) for name in o.__dataclass_fields__ if name != "translation"}
     for name, value in numbers.items():
         if not (np.isfinite(value) and value >= 0.0):
             message = f"options.{name} is {value}: give a finite number that is not negative"
             raise InvalidInput(message, Fault(f"/options/{name}", "negative or not finite"))
+        if value == 0.0 and name in POSITIVE:
+            message = f"options.{name} is zero: no sensor is certain and no time is none, give a small number"
+            raise InvalidInput(message, Fault(f"/options/{name}", "zero"))
     return Tuning(
         o.gyro_noise_rad_per_sqrt_s, o.gyro_bias_walk_rad_per_s_sqrt_s, o.gyro_scale, o.gyro_delay_s, o.gyro_gap_s,
         o.unknown_rate_rad_per_s, o.translation == "bounded", o.speed_m_per_s, o.speed_correlation_s,

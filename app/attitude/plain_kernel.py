@@ -224,22 +224,22 @@ class PlainFilter:
         n = k[K.SUM_WEIGHT]
         b, c = k[K.SUM_FIELD : K.SUM_FIELD + 3] / n, k[K.SUM_IRON : K.SUM_IRON + 3] / n
         G = k[K.SUM_R : K.SUM_R + 9].reshape(3, 3) / n
-        information, right = np.eye(3) * (1.0 + K.LEAST_SPREAD) - G.T @ G, c - G.T @ b
-        iron, now = np.linalg.solve(information, right), self.x[IR].copy()
-        scatter = k[K.SUM_POWER] / n - b @ b - 3.0 * s.reading**2 - 2.0 * now @ right + now @ information @ now
-        explained = (iron - now) @ information @ (iron - now)
+        information, right = np.eye(3) - G.T @ G, c - G.T @ b
+        iron = np.linalg.solve(information + K.LEAST_SPREAD * np.eye(3), right)
+        now, whole = self.x[IR].copy(), k[K.SUM_POWER] / n - b @ b - 3.0 * s.reading**2
+        scatter, left = (whole - 2.0 * h @ right + h @ information @ h for h in (now, iron))
         spread = 1.0 - np.sum(G * G) / 3.0
         k[K.MENDING_S] = max(0.0, k[K.MENDING_S] - dt)
         if spread < K.BLAME_SPREAD:
             return
-        blamed = scatter > K.BLAME_UT**2 and explained > K.BLAME_SHARE * scatter
+        blamed = scatter > K.BLAME_UT**2 and scatter - left > K.BLAME_SHARE * scatter
         if blamed and np.mean((iron - now) ** 2) > K.BLAMED_UT**2:
             self._set_block(IR, iron, K.BLAMED_UT**2)
-            k[K.DISTURBANCE] *= max(0.0, 1.0 - explained / scatter)
+            k[K.DISTURBANCE] *= max(0.0, left / scatter)
             k[K.MENDING_S] = K.MEND_S
         field = b - G @ iron
-        doubted = learned and k[K.MENDING_S] > 0.0 and scatter - explained < 3.0 * K.BLAMED_UT**2
-        if doubted and np.mean((field - self.x[FI]) ** 2) > K.BLAME_UT**2:
+        doubted = learned and k[K.MENDING_S] > 0.0 and left < 3.0 * K.BLAMED_UT**2
+        if doubted and min(np.mean((field - self.x[FI]) ** 2), np.mean(iron**2)) > K.BLAME_UT**2:
             k[K.MENDING_S] = 0.0
             self._set_block(IR, iron, K.BLAMED_UT**2)
             self._set_block(FI, field, K.BLAMED_UT**2)
@@ -292,7 +292,7 @@ class PlainFilter:
     def _shown(self, learned: bool) -> tuple[Array, Array]:
         rate = self.k[K.LAST_GYRO : K.LAST_GYRO + 3] - self.x[BI]
         shown, J = self.attitude * Rotation.from_rotvec(self.s.gyro_delay * rate), np.eye(3, K.SIZE)
-        if learned and self.k[K.NORTH_SET] > 0.0:
+        if learned and (self.k[K.NORTH_SET] > 0.0 or np.isfinite(self.k[K.NORTH])):
             mx, my, _ = self.x[FI]
             R2 = shown.as_matrix()[2]
             shown = Rotation.from_rotvec((self.k[K.DECLINATION] - np.arctan2(my, mx)) * UP) * shown

@@ -25,7 +25,8 @@ def _hard_going(tumbled, rng: np.random.Generator) -> InertialSamples:  # type: 
         )
     )
     t[900:] += 1.0
-    mag[600:] += [10.0, -5.0, 12.0]
+    mag += [19.0, -24.0, 26.0]
+    mag[700:] += [10.0, -5.0, 12.0]
     mag[1300:1450] += 60.0
     for stream, share in ((gyro, 0.1), (force, 0.1), (mag, 0.5)):
         stream[rng.random(len(t)) < share] = np.nan

@@ -173,6 +173,36 @@ def test_a_magnet_put_on_the_device_is_learned(tumble: Callable, kind: str) -> N
     assert np.linalg.norm(state.hard_iron_uT - [18.0, -9.0, 14.0]) < 2.0
 
 
+def test_a_field_learned_with_a_magnet_on_the_device_is_mended(tumble: Callable) -> None:
+    """Yaw counts from a wrong north until the body turns; then hard iron and field are told apart."""
+    tumbled = tumble(seed=16)
+    tumbled.samples.magnetometer_uT[:] += [25.0, -10.0, 40.0]
+    reference = learned_reference()
+    state, run = follow_attitude(begin(tumbled.samples, reference, PLAIN), tumbled.samples, reference, PLAIN)
+    north = Rotation.from_euler("z", np.arctan2(tumbled.field_uT[1], tumbled.field_uT[0]))
+    shown = north * Rotation.from_quat(run.q_body_to_building, scalar_first=True)
+    error = np.rad2deg(np.linalg.norm(tumbled.error_rad(shown.as_quat(scalar_first=True)), axis=1))
+    assert error[400] > 8.0
+    assert error[2000:].max() < 11.0
+    assert error[-1] < 6.0
+    assert np.linalg.norm(state.hard_iron_uT - [25.0, -10.0, 40.0]) < 2.0
+
+
+def test_north_stays_where_it_was_when_the_room_changes_for_good(tumble: Callable) -> None:
+    tumbled = tumble(seed=17, seconds=60.0)
+    attitude = Rotation.from_quat(tumbled.truth[1500:], scalar_first=True)
+    tumbled.samples.magnetometer_uT[1500:] += attitude.inv().apply([15.0, -25.0, 20.0])
+    options, reference = replace(PLAIN, new_field_s=10.0), learned_reference()
+    state, run = follow_attitude(begin(tumbled.samples, reference, options), tumbled.samples, reference, options)
+    north = Rotation.from_euler("z", np.arctan2(tumbled.field_uT[1], tumbled.field_uT[0]))
+    shown = north * Rotation.from_quat(run.q_body_to_building, scalar_first=True)
+    error = np.rad2deg(np.linalg.norm(tumbled.error_rad(shown.as_quat(scalar_first=True)), axis=1))
+    assert not run.magnetometer_used[1550:2400].any()
+    assert run.magnetometer_used[-1000:].all()
+    assert np.linalg.norm(state.field_uT) == pytest.approx(np.linalg.norm([29.0, -17.0, -22.0]), rel=0.1)
+    assert error[1500:].max() < 4.0
+
+
 def test_streams_have_rates_of_their_own(tumble: Callable) -> None:
     """A magnetometer at 144 Hz beside an IMU at 200 Hz (Kuevor, L1047), merged by time, is as good as one clock."""
     tumbled = tumble(seed=12, rate_hz=1000.0, seconds=20.0, turn_rad_per_s=0.5)
@@ -251,3 +281,5 @@ def test_what_cannot_be_used_is_refused(tumble: Callable) -> None:
         begin(samples, MagneticReference(np.zeros((5, 3))))
     with pytest.raises(InvalidInput, match="not negative"):
         follow_attitude(begin(samples, None), samples, None, AttitudeOptions(field_uT=-1.0))
+    with pytest.raises(InvalidInput, match="no sensor is certain"):
+        follow_attitude(begin(samples, None), samples, None, AttitudeOptions(magnetometer_uT=0.0))
