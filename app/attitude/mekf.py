@@ -43,6 +43,11 @@ class AttitudeState:
     kept: Array
 
     @property
+    def t_s(self) -> float:
+        """Of the last sample; not a number before the first."""
+        return float(self.kept[layout.T])
+
+    @property
     def gyro_bias_rad_per_s(self) -> Array:
         """(3,)."""
         return self.mean[:3]

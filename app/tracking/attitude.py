@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from app.attitude.mekf import begin, follow_attitude
-from app.attitude.options import AttitudeOptions
+from app.attitude.mekf import AttitudeState, begin, follow_attitude
+from app.attitude.options import AttitudeOptions, InertialSamples
 from app.attitude.reference import MagneticReference, constant_reference, map_reference
 from app.geometry import Array
 from app.tracking.estimate import Estimate
@@ -48,10 +48,13 @@ def oriented(
 ) -> tuple[Step, "TrackState"]:
     """The step with its readings turned, and the state with the attitude after the step's inertial samples.
 
-    `estimate` is of the step before. Raises InvalidInput (samples that are not later than the last ones, no gravity).
+    `estimate` is of the step before. Samples that are not later than those before count for nothing, and there is no
+    attitude before the accelerometer's first reading.
     """
-    samples, reference = step.inertial, tracker.attitude
-    if samples is None or reference is None or not len(samples):
+    if step.inertial is None or tracker.attitude is None:
+        return step, state
+    samples = _later(step.inertial, state.attitude)
+    if not len(samples) or (state.attitude is None and not np.isfinite(samples.accelerometer_m_per_s2).all(1).any()):
         return step, state
     compared = _reference(tracker, state, estimate, len(samples))
     options = AttitudeOptions(speed_m_per_s=max(AttitudeOptions().speed_m_per_s, tracker.options.speed_m_s))
@@ -66,6 +69,17 @@ def oriented(
         return step, state
     turn = Rotation.from_quat(attitude.q_body_to_frame, scalar_first=True).as_matrix()
     return replace(step, B_uT=turn @ step.B_body_uT, device_to_frame=turn), state
+
+
+def _later(samples: InertialSamples, before: AttitudeState | None) -> InertialSamples:
+    """The samples that come after those that were followed."""
+    if before is None or np.isnan(before.t_s) or samples.t_s[0] > before.t_s:
+        return samples
+    kept = samples.t_s > before.t_s
+    return InertialSamples(
+        samples.t_s[kept], samples.gyro_rad_per_s[kept], samples.accelerometer_m_per_s2[kept],
+        samples.magnetometer_uT[kept],
+    )  # fmt: skip
 
 
 def _reference(

@@ -267,8 +267,15 @@ def test_inertial_samples_need_a_track_with_attitude_and_increasing_times(
     assert answer.json()["errors"][0]["location"] == "/body/steps/0/inertial"
     track = service.http.post("/v1/tracks", json=plain | {"attitude": {"reference": "wmm"}}).json()
     assert track["attitude"]["model"] == "WMM-2025"
-    again = [steps[0], steps[1] | {"inertial": steps[0]["inertial"]}]
-    answer = service.http.post(f"/v1/tracks/{track['id']}/steps", json={"steps": again})
-    assert answer.status_code == 422, answer.text
-    answer = service.http.post(f"/v1/tracks/{track['id']}/steps", json={"steps": steps})
-    assert answer.status_code == 200, "nothing of the refused batch was followed"
+    backwards = steps[0]["inertial"] | {"t_s": steps[0]["inertial"]["t_s"][::-1]}
+    path = f"/v1/tracks/{track['id']}/steps"
+    answer = service.http.post(path, json={"steps": [steps[0] | {"inertial": backwards}]})
+    assert answer.status_code == 422
+    assert "increase" in answer.text
+    # samples that were followed already, or come before the accelerometer's first reading, count for nothing
+    deaf = steps[0]["inertial"] | {"accelerometer_m_per_s2": [None] * 5}
+    first = service.http.post(path, json={"steps": [steps[0] | {"inertial": deaf}]}).json()["estimate"]
+    assert first["attitude"] is None
+    told = service.http.post(path, json={"steps": [steps[1]]}).json()["estimate"]["attitude"]
+    again = steps[1] | {"number": 2}
+    assert service.http.post(path, json={"steps": [again]}).json()["estimate"]["attitude"] == told
