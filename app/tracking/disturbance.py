@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from app.geometry import Array
+from app.tracking.particle_filter import normalise
 from app.tracking.particles import Advance
 
 __all__ = ["LONGEST_M", "is_disturbed", "softened"]
@@ -18,14 +19,18 @@ __all__ = ["LONGEST_M", "is_disturbed", "softened"]
 LONGEST_M = 8.0
 CHANCE = 1e-4
 """Of an innovation beyond it, by the variance it should have."""
+LIMIT = {components: float(chdtri(components, CHANCE)) for components in (1, 2, 3)}
+"""What chi-square exceeds with that chance, by its degrees of freedom."""
 PLAUSIBLE_SHARE = 0.05
 """Of the belief, for which the reading is no surprise: with less it is disturbed."""
 
 
-def is_disturbed(innovation: Array, weight: Array, components: int) -> bool:
-    """innovation (n, 2): squares and variance of each particle's, of so many components; weight (n,) before it."""
-    limit = float(chdtri(components, CHANCE))
-    return float(weight[innovation[:, 0] <= limit * innovation[:, 1]].sum()) < PLAUSIBLE_SHARE
+def is_disturbed(innovation: Array, log_weight: Array, components: int) -> bool:
+    """innovation (n, 2): squares and variance of each particle's, of so many components; log_weight (n,) before it."""
+    plausible = innovation[:, 0] <= LIMIT[components] * innovation[:, 1]
+    if plausible.all():
+        return False
+    return float(normalise(log_weight).weight[plausible].sum()) < PLAUSIBLE_SHARE
 
 
 def softened(move: Advance, innovation: Array, components: int) -> Advance:

@@ -206,7 +206,7 @@ def _advanced(
     moved = advance(particles, move, tracker.places, tracker.barriers, noise, innovation)
     since_m = state.path_m if state.disturbed_from_m is None else state.disturbed_from_m
     believed = state.state == "converged" and state.path_m - since_m <= LONGEST_M
-    if not believed or not is_disturbed(innovation, normalise(particles.log_weight).weight, components):
+    if not believed or not is_disturbed(innovation, particles.log_weight, components):
         return moved, move, replace(state, disturbed_from_m=None)
     move = softened(move, innovation, components)
     moved = advance(particles, move, tracker.places, tracker.barriers, noise)

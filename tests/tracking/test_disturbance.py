@@ -59,9 +59,11 @@ def test_a_passing_trolley_neither_moves_nor_loses_the_track(hall_grid: FieldGri
 
 
 def test_a_reading_that_some_of_the_belief_explains_is_none() -> None:
-    weight = np.full(100, 0.01)
+    even = np.zeros(100)
     innovation = np.column_stack([np.full(100, 400.0), np.ones(100)])
-    assert is_disturbed(innovation, weight, 3)
+    assert is_disturbed(innovation, even, 3)
     innovation[:6, 0] = 3.0
-    assert not is_disturbed(innovation, weight, 3)
-    assert is_disturbed(innovation, np.append(np.full(6, 1e-4), np.full(94, (1 - 6e-4) / 94)), 3)
+    assert not is_disturbed(innovation, even, 3)
+    assert is_disturbed(innovation, np.append(np.full(6, -5.0), np.zeros(94)), 3)
+    innovation[:, 0] = 3.0
+    assert not is_disturbed(innovation, even, 3)
