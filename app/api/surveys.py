@@ -121,9 +121,9 @@ class SurveySamples(BaseModel):
 
 
 def show_survey(row: Survey) -> SurveyView:
-    names = ("id", "floor_id", "name", "format", "frame", "sample_count", "included", "created_at", "calibration_id",
-             "excluded_s")  # fmt: skip
-    told = {name: row.report.get(name) for name in ("session", "replaces")} | {"sha256": row.raw_sha256}
+    names = ("id", "floor_id", "name", "format", "frame", "sample_count", "included", "created_at", "calibration_id")
+    told = {name: row.report.get(name) for name in ("session", "replaces")}
+    told |= {"sha256": row.raw_sha256, "excluded_s": row.excluded_s or []}
     return SurveyView.model_validate(told | {name: getattr(row, name) for name in names})
 
 
@@ -191,7 +191,8 @@ async def upload_survey(
     def receive() -> Response:
         parsed = parse_survey(
             context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
-            session=session, calibration=told.calibration, anchor=told.anchor, today=datetime.now(UTC).date(),
+            session=session, calibration=told.calibration,
+            at=None if told.anchor is None else (told.anchor, datetime.now(UTC).date()),
         )  # fmt: skip
 
         def create(transaction: Session) -> tuple[int, BaseModel]:
@@ -340,7 +341,7 @@ def get_disturbances(survey_id: Id, context: ContextDep, identity: SurveyReading
             survey_id=survey_id,
             map_id=None if quality is None else quality[0],
             stretches=_disturbances(context, survey, quality),
-            excluded_s=survey.excluded_s,
+            excluded_s=survey.excluded_s or [],
         )
 
 
@@ -369,15 +370,15 @@ def get_samples(
 def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> PatchedSurvey:
     with context.transaction() as session:
         survey = _lock_survey(session, identity, survey_id)
-        before = survey.included, survey.excluded_s
+        before = survey.included, survey.excluded_s or []
         if "included" in body.model_fields_set:
             survey.included = body.included
         if "excluded_s" in body.model_fields_set:
             survey.excluded_s = checked_stretches(body.excluded_s, "/body/excluded_s")
         if "exclude_disturbed" in body.model_fields_set:
             found = _disturbances(context, survey, _active_quality(session, survey))
-            survey.excluded_s = union_s([*survey.excluded_s, *([each.start_s, each.end_s] for each in found)])
-        changed = before != (survey.included, survey.excluded_s) and (before[0] or survey.included)
+            survey.excluded_s = union_s([*(survey.excluded_s or []), *([each.start_s, each.end_s] for each in found)])
+        changed = before != (survey.included, survey.excluded_s or []) and (before[0] or survey.included)
         session.flush()
         job = _rebuild(session, context, survey.floor_id) if changed else None
         return PatchedSurvey(**show_survey(survey).model_dump(), job=show_job(job) if job else None)

@@ -163,7 +163,7 @@ class Calibration(Base):
 
 class Survey(Base):
     """`calibration_id`: that of the device which walked it, applied to its samples as they came in. `excluded_s`:
-    stretches of its time that no map is built from, [[start, end], ...]."""
+    stretches of its time that no map is built from, [[start, end], ...], or null."""
 
     __tablename__ = "survey"
     __table_args__ = (UniqueConstraint("floor_id", "raw_sha256", "format", "frame"),)
@@ -179,7 +179,7 @@ class Survey(Base):
     report: Mapped[dict[str, Any]]
     included: Mapped[bool] = mapped_column(default=True)
     calibration_id: Mapped[str | None] = mapped_column(ForeignKey("calibration.id"))
-    excluded_s: Mapped[list[list[float]]] = mapped_column(JSON, default=list, server_default="[]")
+    excluded_s: Mapped[list[list[float]] | None] = mapped_column(JSON(none_as_null=True))
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 

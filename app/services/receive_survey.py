@@ -57,13 +57,12 @@ def parse_survey(
     elevation_m: float,
     session: str | None = None,
     calibration: AppliedCalibration | None = None,
-    anchor: Anchor | None = None,
-    today: date,
+    at: tuple[Anchor, date] | None = None,
 ) -> ParsedSurvey:
     """Read a survey file and store its bytes and its samples. Raises UnreadableSurvey; then nothing is stored.
 
     The device's `calibration` is applied to its readings; surveys of one calibration share a session, unless it is
-    told. With an `anchor` the walk is checked against the Earth's field there, `today`.
+    told. `at` an anchor and a date the walk is checked against the Earth's field.
     """
     if calibration is not None and session is None:
         session = calibration.label
@@ -71,7 +70,7 @@ def parse_survey(
         data, format=format, frame=frame, session=session, elevation_m=elevation_m, calibration=calibration
     )
     samples = walk.samples
-    told = _told_calibration(calibration) | _earth_check(walk, anchor, today)
+    told = _told_calibration(calibration) | _earth_check(walk, at)
     report = walk.report | told | {"disturbances": by_itself(samples)}
     return ParsedSurvey(
         format=format,
@@ -91,11 +90,12 @@ def _told_calibration(calibration: AppliedCalibration | None) -> dict[str, objec
     return {"calibration": None if calibration is None else calibration.told}
 
 
-def _earth_check(walk: Walk, anchor: Anchor | None, today: date) -> dict[str, object]:
+def _earth_check(walk: Walk, at: tuple[Anchor, date] | None) -> dict[str, object]:
     """How the walk compares with the Earth's field, and its findings among the warnings."""
-    if anchor is None:
+    if at is None:
         return {"reference_field": None}
-    field = earth_field(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m, today)
+    anchor, on = at
+    field = earth_field(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m, on)
     check = check_against_earth(walk.samples, field_in_building_uT(field, anchor), bearing_known=True)
     warnings = walk.report["warnings"]
     assert isinstance(warnings, list)
@@ -105,7 +105,7 @@ def _earth_check(walk: Walk, anchor: Anchor | None, today: date) -> dict[str, ob
         "warnings": [*warnings, *check.findings],
         "reference_field": {
             "model": field.model,
-            "date": today.isoformat(),
+            "date": on.isoformat(),
             "magnitude_ut": round(check.earth_magnitude_uT, 3),
             "inclination_deg": round(degrees(check.earth_inclination_rad), 2),
             "measured_magnitude_ut": round(check.magnitude_uT, 3),

@@ -37,7 +37,7 @@ def upgrade() -> None:
     op.create_index("ix_calibration_organisation_id_id", "calibration", ["organisation_id", "id"])
     with op.batch_alter_table("survey") as survey:
         survey.add_column(sa.Column("calibration_id", sa.String(36), nullable=True))
-        survey.add_column(sa.Column("excluded_s", sa.JSON(), nullable=False, server_default="[]"))
+        survey.add_column(sa.Column("excluded_s", sa.JSON(), nullable=True))
         survey.create_foreign_key("fk_survey_calibration_id_calibration", "calibration", ["calibration_id"], ["id"])
 
 
