@@ -8,6 +8,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,16 @@ class BlobStoreContract(ABC):
         store = self.open(tmp_path)
         assert store.put(b"magnetite") == store.put(b"magnetite")
         assert store.get(store.put(b"magnetite")) == b"magnetite"
+
+    def test_it_lists_what_it_holds(self, tmp_path: Path) -> None:
+        store = self.open(tmp_path)
+        held = {store.put(data): len(data) for data in (b"", b"magnetite", b"x" * 5000)}
+        listed = list(store.stored())
+        assert {each.sha256: each.size_bytes for each in listed} == held
+        assert [each.sha256 for each in listed] == sorted(held)
+        assert all(abs((datetime.now(UTC) - each.stored_at).total_seconds()) < 60 for each in listed)
+        store.discard(listed[0].sha256)
+        assert len(list(store.stored())) == 2
 
     def test_blobs_outlive_the_store_object(self, tmp_path: Path) -> None:
         sha256 = self.open(tmp_path).put(b"magnetite")

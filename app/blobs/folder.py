@@ -1,42 +1,19 @@
-"""The blob store: immutable bytes under the SHA-256 of their content.
+"""Blobs in a local folder. Putting the same bytes again, also from several processes at once, is the same as once.
 
-A blob is there whole or not at all: it is written under a temporary name in the same file system, forced to the
-disk, and renamed. Putting the same bytes again, also from several processes at once, is the same as putting them once.
+A blob is written under a temporary name in the same file system, forced to the disk, and renamed.
 """
 
 import hashlib
 import os
-import re
 import tempfile
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Protocol
-from urllib.parse import unquote, urlsplit
 
-from app.errors import CorruptArtefact, InvalidInput, NotFound
+from app.blobs.store import StoredBlob, check_name
+from app.errors import CorruptArtefact, NotFound
 
-__all__ = ["BlobStore", "FolderBlobStore", "open_blob_store"]
-
-_SHA256 = re.compile(r"[0-9a-f]{64}")
-
-
-class BlobStore(Protocol):
-    """What every store keeps to; `BlobStoreContract` in the tests says it in full."""
-
-    def put(self, data: bytes) -> str:
-        """Store bytes durably and return their SHA-256, 64 lower-case hexadecimal digits."""
-        ...
-
-    def get(self, sha256: str) -> bytes:
-        """The bytes, checked. Raises NotFound if there are none, CorruptArtefact if they do not match their hash."""
-        ...
-
-    def exists(self, sha256: str) -> bool:
-        """Whether the store has a blob of this hash (its content is checked by `get`)."""
-        ...
-
-    def discard(self, sha256: str) -> None:
-        """Forget a blob that nothing refers to any more; none there is as good."""
-        ...
+__all__ = ["FolderBlobStore"]
 
 
 class FolderBlobStore:
@@ -59,7 +36,7 @@ class FolderBlobStore:
         return sha256
 
     def get(self, sha256: str) -> bytes:
-        _check_name(sha256)
+        check_name(sha256)
         try:
             data = self._path(sha256).read_bytes()
         except FileNotFoundError:
@@ -72,12 +49,20 @@ class FolderBlobStore:
         return data
 
     def exists(self, sha256: str) -> bool:
-        _check_name(sha256)
+        check_name(sha256)
         return self._path(sha256).is_file()
 
     def discard(self, sha256: str) -> None:
-        _check_name(sha256)
+        check_name(sha256)
         self._path(sha256).unlink(missing_ok=True)
+
+    def stored(self) -> Iterator[StoredBlob]:
+        for path in sorted(self._folder.glob("[0-9a-f][0-9a-f]/[0-9a-f][0-9a-f]/*")):
+            try:
+                told = path.stat()
+            except FileNotFoundError:  # discarded meanwhile
+                continue
+            yield StoredBlob(path.name, told.st_size, datetime.fromtimestamp(told.st_mtime, UTC))
 
     def _path(self, sha256: str) -> Path:
         return self._folder / sha256[:2] / sha256[2:4] / sha256
@@ -103,22 +88,6 @@ class FolderBlobStore:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-
-
-def open_blob_store(url: str) -> BlobStore:
-    """The store at a `file://` address. Raises InvalidInput for addresses that are not offered."""
-    parts = urlsplit(url)
-    if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path.startswith("/"):
-        return FolderBlobStore(Path(unquote(parts.path)))
-    if parts.scheme == "s3":
-        raise InvalidInput(f"blob address {url!r}: s3:// is not offered yet; use file:///FOLDER")
-    raise InvalidInput(f"blob address {url!r} cannot be read: use file:///FOLDER with an absolute path")
-
-
-def _check_name(sha256: str) -> None:
-    # Also what keeps `../` out of paths.
-    if not _SHA256.fullmatch(sha256):
-        raise NotFound(f"{sha256[:80]!r} is not the SHA-256 of a blob: 64 lower-case hexadecimal digits are expected")
 
 
 def _sync_folder(folder: Path) -> None:

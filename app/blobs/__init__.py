@@ -1,0 +1,20 @@
+"""The blob store: immutable bytes under the SHA-256 of their content."""
+
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from app.blobs.folder import FolderBlobStore
+from app.blobs.store import BlobStore, StoredBlob
+from app.errors import InvalidInput
+
+__all__ = ["BlobStore", "FolderBlobStore", "StoredBlob", "open_blob_store"]
+
+
+def open_blob_store(url: str) -> BlobStore:
+    """The store at a `file://` address. Raises InvalidInput for addresses that are not offered."""
+    parts = urlsplit(url)
+    if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path.startswith("/"):
+        return FolderBlobStore(Path(unquote(parts.path)))
+    if parts.scheme == "s3":
+        raise InvalidInput(f"blob address {url!r}: s3:// is not offered yet; use file:///FOLDER")
+    raise InvalidInput(f"blob address {url!r} cannot be read: use file:///FOLDER with an absolute path")
