@@ -65,7 +65,7 @@ def walk(grid: FieldGrid, size_uT: float, seed: int) -> tuple[float, float, floa
     for k in range(n):
         followed = follow(tracker, state, Step(k, float(t[k]), B[k], np.append(reckoned[k], 0.0), yaw_rad=0.0))
         state = followed.state
-        disturbed[k] = state.disturbed_from_m is not None
+        disturbed[k] = state.disturbed
         if followed.estimate is not None:
             error[k] = np.hypot(*(np.array(followed.estimate.position_m[:2]) - p[k]))
     during = (t > 20.0) & (t < 34.0)
@@ -76,13 +76,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--walks", type=int, default=8)
     asked = parser.parse_args()
-    grid, longest = hall(), tracking.LONGEST_M
+    grid, fits = hall(), tracking.is_disturbed
     print(f"{'size':>8} {'believed':>10} {'tested':>10} {'ratio':>7} {'disturbed during, else':>24}")
     good = True
     for size in SIZES_UT:
-        tracking.LONGEST_M = -1.0
+        tracking.is_disturbed = lambda *_: False
         believed = np.mean([walk(grid, size, seed)[0] for seed in range(asked.walks)])
-        tracking.LONGEST_M = longest
+        tracking.is_disturbed = fits
         tested, during, otherwise = np.mean([walk(grid, size, seed) for seed in range(asked.walks)], axis=0)
         print(
             f"{size:6g} uT {believed:8.2f} m {tested:8.2f} m {tested / believed:7.2f} {during:12.3f} {otherwise:11.4f}"

@@ -54,7 +54,7 @@ def tell(tracker: Tracker, followed: Followed) -> Told:
         "step": state.step.number,
         "t_s": state.step.t_s,
         "probability": followed.probability,
-        "disturbed": state.disturbed_from_m is not None,
+        "disturbed": state.disturbed,
         "attitude": None if state.turned is None else _attitude(tracker, state, state.turned),
     }
     return told if estimate is None else told | _place(tracker, estimate)

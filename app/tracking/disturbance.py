@@ -2,7 +2,8 @@
 
 A converged track that is right meets such readings rarely and one that is wrong meets them for long. So they count for
 little, by the variance that makes the innovation one of one sigma (Brommer, L193, Eq. 17), and say nothing for or
-against the place, but only along LONGEST_M: then they count as all others, and the track may find that it is lost.
+against the place, as long as there is patience: PATIENCE_M of the way, which come back three times as slowly on
+readings that fit. Without it they count as all others, and the track may find that it is lost.
 """
 
 from dataclasses import replace
@@ -14,9 +15,9 @@ from app.geometry import Array
 from app.tracking.particle_filter import normalise
 from app.tracking.particles import Advance
 
-__all__ = ["LONGEST_M", "is_disturbed", "softened"]
+__all__ = ["PATIENCE_M", "RECOVERS", "is_disturbed", "softened"]
 
-LONGEST_M = 8.0
+PATIENCE_M, RECOVERS = 8.0, 1.0 / 3.0
 CHANCE = 1e-4
 """Of an innovation beyond it, by the variance it should have."""
 LIMIT = {components: float(chdtri(components, CHANCE)) for components in (1, 2, 3)}

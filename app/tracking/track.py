@@ -21,7 +21,7 @@ from app.positioning.features import common_components
 from app.positioning.floors import SearchableFloor, reduce_floor, shared_noise_sd_uT
 from app.positioning.window import WindowFrame
 from app.tracking.attitude import oriented
-from app.tracking.disturbance import LONGEST_M, is_disturbed, softened
+from app.tracking.disturbance import PATIENCE_M, RECOVERS, is_disturbed, softened
 from app.tracking.estimate import Estimate, carried_on
 from app.tracking.gather import gathered, moved_on
 from app.tracking.ground import barriers_of
@@ -184,7 +184,7 @@ def _weigh(
     particles = replace(particles, log_weight=particles.log_weight - gained)
     particles = _on_floors(tracker, state, particles, before, reading, move, rng)
     walked, lost = state.gains[-1]
-    if state.disturbed_from_m is not None or share_between_floors(particles, weight, tracker.places) > 0.5:
+    if state.disturbed or share_between_floors(particles, weight, tracker.places) > 0.5:
         gained = -lost  # on stairs, and beside a magnet, neither the map nor its absence tells anything
     gains = (*state.gains[:-1], (walked, lost + gained))
     log_odds = min(state.log_odds + lost + gained, MOST_ODDS)
@@ -204,14 +204,16 @@ def _advanced(
     """Particles at the reading, which counts for little if it is disturbed: the move then, and the state, say so."""
     innovation, components = np.zeros((len(particles), 2)), len(tracker.places.scale)
     moved = advance(particles, move, tracker.places, tracker.barriers, noise, innovation)
-    since_m = state.path_m if state.disturbed_from_m is None else state.disturbed_from_m
-    believed = state.state == "converged" and state.path_m - since_m <= LONGEST_M
-    if not believed or not is_disturbed(innovation, particles.log_weight, components):
-        return moved, move, replace(state, disturbed_from_m=None)
+    if state.state != "converged" or not is_disturbed(innovation, particles.log_weight, components):
+        patience_m = min(state.patience_m + RECOVERS * move.distance_m, PATIENCE_M)
+        return moved, move, replace(state, disturbed=False, patience_m=patience_m)
+    if state.patience_m <= 0.0:
+        return moved, move, replace(state, disturbed=False)
     move = softened(move, innovation, components)
     moved = advance(particles, move, tracker.places, tracker.barriers, noise)
     recent = state.recent.with_last_disturbed()
-    return moved, move, replace(state, recent=recent, disturbed_from_m=since_m, disturbed=state.disturbed + 1)
+    left_m = state.patience_m - move.distance_m
+    return moved, move, replace(state, recent=recent, disturbed=True, patience_m=left_m)
 
 
 def _on_floors(

@@ -10,6 +10,7 @@ from app.geometry import Array
 from app.positioning.floors import SearchableFloor
 from app.positioning.window import WindowFrame
 from app.tracking.attitude import Attitude, AttitudeReference
+from app.tracking.disturbance import PATIENCE_M
 from app.tracking.estimate import Estimate, State, describe
 from app.tracking.ground import Barriers
 from app.tracking.no_map import NoMap
@@ -64,7 +65,7 @@ class TrackState:
     tells_height    whether the device ever said that it rose or sank
     estimate_from_m (3,) where the device reckoned to be when the estimate was made
     attitude, turned   of the attitude filter, where inertial samples are sent: its state, and what it says
-    disturbed_from_m, disturbed   path at which readings began to be disturbed, if the last one was; how many were
+    disturbed       whether the last reading was; patience_m: over how much of the way others may still be
     """
 
     step: Step | None = None
@@ -87,8 +88,8 @@ class TrackState:
     estimate: Estimate | None = None
     estimate_from_m: Array | None = None
     converged_at_m: float | None = None
-    disturbed_from_m: float | None = None
-    disturbed: int = 0
+    disturbed: bool = False
+    patience_m: float = PATIENCE_M
     attitude: AttitudeState | None = None
     turned: Attitude | None = None
 

@@ -13,6 +13,12 @@ ANCHOR = {"latitude_deg": 42.294431, "longitude_deg": -83.710442, "height_m": 23
 
 
 @pytest.fixture(scope="module")
+def database_url(sqlite_url: str) -> str:
+    """The database is asked for rows by their ids alone, as in test_calibrations, which runs on both kinds."""
+    return sqlite_url
+
+
+@pytest.fixture(scope="module")
 def carried(true_field_uT: Callable[..., np.ndarray]) -> tuple[dict[str, Any], np.ndarray, Rotation]:
     """A minute's walk over the small floor, the device tilting in the hand: the query's columns, places, attitudes."""
     rng = np.random.default_rng(4)

@@ -9,6 +9,12 @@ import pytest
 ANN_ARBOR = {"latitude_deg": 42.294431, "longitude_deg": -83.710442, "height_m": 236.0}
 
 
+@pytest.fixture(scope="module")
+def database_url(sqlite_url: str) -> str:
+    """The database is asked for rows by their ids alone, as in test_calibrations, which runs on both kinds."""
+    return sqlite_url
+
+
 def test_by_place_and_date(service: Any) -> None:
     told = service.http.get("/v1/reference-field", params=ANN_ARBOR | {"date": "2022-09-01"}).json()
     assert told["magnitude_ut"] == pytest.approx(53.1351, abs=5e-5)
