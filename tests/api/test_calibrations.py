@@ -104,7 +104,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no time in UTC": ({"measured_at": "0001-01-01T00:00:00+14:00"}, "measured_at"),
     "mostly at rest": ({"b_ut": [[20.0, 1.0, -40.0]] * 600 + turned(500)}, "at rest"),
     "beyond any sensor": ({"method": "ellipsoid", "b_ut": (3e8 * np.random.default_rng(0).normal(
-        size=(100, 3))).clip(-1e9, 1e9).tolist()}, ""),
+        size=(100, 3))).clip(-1e9, 1e9).tolist()}, "microtesla"),
     "before the models": ({"reference": PLACE | {"date": "1999-01-01"}}, "2010"),
     "a walk for turning": ({"walk": {"floor_id": "x", "orientation": [], "position_m": []}}, "map_aided"),
     "no walk": ({"method": "map_aided"}, "walk"),
