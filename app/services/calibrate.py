@@ -158,6 +158,8 @@ def _on_a_map(
         noise_uT=NOISE_UT,
         device_to_frame=rotation,
     )  # fmt: skip
+    for each in maps:
+        check_vector(grids.grid(each.grid_sha256))
     found = calibrate_on_map(window, grids.searchable([(each.floor_id, each.grid_sha256) for each in maps]))
     if found.fix.status != "fix":
         reason = f"where the walk went is not found: {found.fix.reason or found.fix.status}"

@@ -321,6 +321,21 @@ def test_a_phone_is_calibrated_by_a_walk_nobody_told_the_way_of(
     assert answer.status_code == 422, "standing still tells nothing"
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_map_without_directions_calibrates_nothing(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], walked: Any, known: bool
+) -> None:
+    floor = new_floor()
+    service.http.post(f"/v1/floors/{floor}/surveys", params={"frame": "level"}, content=walk_csv(1))
+    service.run_jobs()
+    readings, p, q = walked(seed=3, n=100)
+    way = {"position_m": p.tolist()} if known else {"displacement_m": (p - p[0]).tolist()}
+    walk = {"floor_id": floor, "orientation": q.tolist()} | way
+    answer = calibrate(service, device="x", method="map_aided", reference=None, walk=walk, b_ut=readings.tolist())
+    assert answer.status_code == 422, answer.text
+    assert "direction" in answer.text
+
+
 def test_drift_and_equivalence(service: Any) -> None:
     made = [
         calibrate(service, device="drifting", b_ut=np.add(turned(seed=k), [0.5 * k, 0, 0]).tolist(),
