@@ -121,8 +121,8 @@ def _magnetometer(trace: Trace, session: str | None, correct: Callable[[Array], 
     raw, calibrated = trace.streams.get("MAGNETIC_FIELD_UNCALIBRATED"), trace.streams.get("MAGNETIC_FIELD")
     if correct is not None and raw is None:
         raise UnreadableSurvey(
-            "the calibration cannot be applied: the trace has no TYPE_MAGNETIC_FIELD_UNCALIBRATED, and the phone took a "
-            "bias of its own off the rest",
+            "the calibration cannot be applied: the trace has no TYPE_MAGNETIC_FIELD_UNCALIBRATED, and the phone took "
+            "a bias of its own off the rest",
             Fault("calibration", "no raw channel"),
         )
     stream = raw or calibrated

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,13 @@ def test_the_same_request_again_makes_no_second_version(service: Any) -> None:
     assert first.status_code == 201, first.text
     assert first.json() == again.json()
     assert len(service.http.get("/v1/calibrations", params={"device": "once"}).json()["items"]) == 1
+
+
+def test_many_calibrations_of_one_device_at_once_are_all_kept(service: Any) -> None:
+    with ThreadPoolExecutor(10) as threads:
+        answers = list(threads.map(lambda k: calibrate(service, device="busy", b_ut=turned(100, seed=k)), range(10)))
+    assert [answer.status_code for answer in answers] == [201] * 10
+    assert sorted(answer.json()["version"] for answer in answers) == list(range(1, 11))
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
