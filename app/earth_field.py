@@ -5,6 +5,7 @@ end of 2029, WMM-2020, WMM-2015v2 and WMM-2010 before. Heights are above the WGS
 needs the geoid's undulation added (Kuevor's 270 m at Ann Arbor are 236 m of ellipsoidal height, and 0.9 nT).
 """
 
+from calendar import isleap
 from dataclasses import dataclass
 from datetime import date
 from functools import lru_cache
@@ -84,7 +85,7 @@ def earth_field(latitude_deg: float, longitude_deg: float, height_m: float, on: 
     epoch = max(year for year in _MODELS if year <= max(on.year, min(_MODELS)))
     coefficients = _MODELS[epoch]
     model = GeoMag(coefficients_data=coefficients)
-    decimal_year = on.year + (on - date(on.year, 1, 1)).days / (date(on.year + 1, 1, 1) - date(on.year, 1, 1)).days
+    decimal_year = on.year + (on - date(on.year, 1, 1)).days / (366 if isleap(on.year) else 365)
 
     def at(year: float) -> Array:
         told = model.calculate(latitude_deg, longitude_deg, 1e-3 * height_m, year, allow_date_outside_lifespan=True)

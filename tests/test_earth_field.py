@@ -82,6 +82,10 @@ def test_places_off_the_earth(place: tuple[float, float, float], where: str) -> 
     assert caught.value.faults[0].location == where
 
 
+def test_the_last_day_of_the_calendar() -> None:
+    assert not earth_field(48.0, 11.0, 0.0, date(9999, 12, 31)).valid
+
+
 def test_before_the_models() -> None:
     with pytest.raises(InvalidInput, match="2010"):
         earth_field(0.0, 0.0, 0.0, date(2009, 12, 31))

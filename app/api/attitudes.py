@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from app.api.auth import Identity, Measuring
 from app.api.context import Context, ContextDep
 from app.api.locate_request import FloorId
-from app.api.models import AppliedView, Finite, Name, Point, RequestModel
+from app.api.models import AppliedView, Finite, Name, Point, RequestModel, Seconds
 from app.api.problems import ERROR_RESPONSES
 from app.attitude.euler import euler_zyx_rad, euler_zyx_variance_rad2
 from app.attitude.mekf import AttitudeRun
@@ -49,7 +49,7 @@ class AttitudeReference(RequestModel):
     )
     position_m: Annotated[
         Point | list[Point] | None,
-        Field(max_length=MOST_SAMPLES, description="of map_point one place, of map one for every sample"),
+        Field(min_length=1, max_length=MOST_SAMPLES, description="of map_point one place, of map one for every sample"),
     ] = None
     position_sd_m: Annotated[Finite, Field(ge=0, le=50, description="of the positions, per axis")] = 0.3
     horizontal_ut: Annotated[Finite | None, Field(gt=0.5, le=150)] = None
@@ -102,7 +102,7 @@ class AttitudeQuery(RequestModel):
     """Samples in the device's axes, null where a sensor has none. At rest the accelerometer reads +g upwards."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [_EXAMPLE]})
-    t_s: Annotated[list[Finite], Field(min_length=2, max_length=MOST_SAMPLES)]
+    t_s: Annotated[list[Seconds], Field(min_length=2, max_length=MOST_SAMPLES)]
     gyro_rad_per_s: Rows
     accelerometer_m_per_s2: Rows
     magnetometer_ut: Rows | None = None

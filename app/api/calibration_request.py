@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from fastapi import Query
-from pydantic import AwareDatetime, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, AwareDatetime, ConfigDict, Field, StringConstraints, model_validator
 
 from app.api.locate_request import FloorId, Quaternion, Vector
 from app.api.models import Finite, Name, Point, RequestModel
@@ -51,6 +51,14 @@ class ReferenceBody(RequestModel):
         Literal["up", "down"], Field(description="where the sensor's z points while it is turned level")
     ] = "up"
 
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.latitude_deg is None) != (self.longitude_deg is None):
+            raise ValueError("a place is latitude_deg and longitude_deg: send both, or magnitude_ut instead")
+        if self.building_id is not None and self.latitude_deg is not None:
+            raise ValueError("send building_id or a latitude and longitude, not both")
+        return self
+
 
 class WalkBody(RequestModel):
     """A walk through a mapped building, for method map_aided: a row for each reading.
@@ -91,6 +99,14 @@ class WalkBody(RequestModel):
         return told
 
 
+def _in_utc(time: datetime | None) -> datetime | None:
+    """As it is kept. The first and the last hours of the calendar have no such time in some zones."""
+    try:
+        return None if time is None else time.astimezone(UTC)
+    except OverflowError:
+        raise ValueError("this time is off the calendar in UTC") from None
+
+
 class NewCalibration(RequestModel):
     model_config = ConfigDict(
         extra="forbid",
@@ -117,7 +133,7 @@ class NewCalibration(RequestModel):
     ]
     reference: ReferenceBody | None = None
     walk: WalkBody | None = None
-    measured_at: Annotated[AwareDatetime | None, Field(description="default: now")] = None
+    measured_at: Annotated[AwareDatetime | None, AfterValidator(_in_utc), Field(description="default: now")] = None
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -132,7 +148,7 @@ class NewCalibration(RequestModel):
         told = self.reference
         if told is None:
             raise ValueError("say by reference what the Earth's field was: its magnitude, or the place")
-        placed = told.building_id is not None or (told.latitude_deg is not None and told.longitude_deg is not None)
+        placed = told.building_id is not None or told.latitude_deg is not None
         if self.method in CIRCLE_METHODS:
             if not placed and (told.horizontal_ut is None or told.vertical_ut is None):
                 raise ValueError(f"{self.method} needs reference: horizontal_ut and vertical_ut, or the place")

@@ -5,9 +5,10 @@ from typing import Annotated, Any
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-__all__ = ["AppliedView", "Finite", "Id", "Metres", "Name", "Point", "RequestModel", "unchanged"]
+__all__ = ["AppliedView", "Finite", "Id", "Metres", "Name", "Point", "RequestModel", "Seconds", "unchanged"]
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Seconds = Annotated[float, Field(allow_inf_nan=False, ge=-1e11, le=1e11)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 Point = Annotated[list[Metres], Field(min_length=3, max_length=3, examples=[[12.3, 4.5, 1.2]])]
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, mode
 
 from app.api.attitudes import ImuRow
 from app.api.locate_request import FloorId, Microtesla, OrientationFrame, PriorBody, Quaternion, Radians, Vector
-from app.api.models import Finite, Name, RequestModel
+from app.api.models import Finite, Name, RequestModel, Seconds
 from app.errors import Fault, InvalidInput
 from app.services.step_order import RawStep
 from app.services.track_spec import StepKind
@@ -38,7 +38,7 @@ def _shape_of_field(value: object) -> str:
 class InertialBody(RequestModel):
     """Samples of a device, null where a sensor has none; at rest the accelerometer reads +g upwards."""
 
-    t_s: Annotated[list[Finite], Field(min_length=1, max_length=MOST_INERTIAL)]
+    t_s: Annotated[list[Seconds], Field(min_length=1, max_length=MOST_INERTIAL)]
     gyro_rad_per_s: Annotated[list[ImuRow], Field(max_length=MOST_INERTIAL)]
     accelerometer_m_per_s2: Annotated[list[ImuRow], Field(max_length=MOST_INERTIAL)]
     magnetometer_ut: Annotated[list[ImuRow] | None, Field(max_length=MOST_INERTIAL)] = None
@@ -71,7 +71,7 @@ class StepBody(RequestModel):
     number: Annotated[
         int, Field(ge=0, le=MOST_NUMBER, description="counts from 0; one that was followed is a duplicate")
     ]
-    t_s: Annotated[Finite, Field(ge=-1e11, le=1e11, description="seconds on any clock; does not decrease")]
+    t_s: Annotated[Seconds, Field(description="seconds on any clock; does not decrease")]
     b_ut: Annotated[
         Annotated[Vector, Tag("vectors")] | Annotated[Microtesla, Tag("magnitudes")],
         Discriminator(_shape_of_field),

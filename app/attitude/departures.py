@@ -112,7 +112,7 @@ def _judged_spans(t_s: Array, path_m: Array, z: Array, expected: Expected) -> tu
     durations = [d for d in DURATIONS_S if d <= MOST_OF_WALK * whole_s]
     spans, p_values = [np.empty((0, 2), np.intp)], [np.empty(0)]
     for duration in durations:
-        begin = np.arange(t_s[0], t_s[-1] - duration + 1e-9, duration / 4.0)
+        begin = _begins_s(t_s, duration)
         start, stop = np.searchsorted(t_s, begin), np.searchsorted(t_s, begin + duration)
         filled = (stop - start >= FEWEST) & (t_s[np.maximum(stop - 1, 0)] - t_s[np.minimum(start, len(t_s) - 1)]
                                               >= 0.7 * duration)  # fmt: skip
@@ -129,6 +129,14 @@ def _judged_spans(t_s: Array, path_m: Array, z: Array, expected: Expected) -> tu
         spans.append(np.stack([start, stop], axis=1))
         p_values.append(chance)
     return np.concatenate(spans), np.concatenate(p_values)
+
+
+def _begins_s(t_s: Array, duration_s: float) -> Array:
+    """Starts of spans, a quarter of a duration apart, that hold a sample: a log may be silent for years in between."""
+    step_s = duration_s / 4.0
+    k = np.unique(np.floor((t_s - t_s[0]) / step_s)[:, None] - np.arange(4.0))
+    begin = t_s[0] + step_s * k[k >= 0.0]
+    return np.asarray(begin[begin <= t_s[-1] - duration_s + 1e-9])
 
 
 def _variance_of_mean(count: Array, length_m: Array, structure: ErrorStructure) -> Array:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import f
 
-from app.attitude.sudden_changes import runs_of
+from app.attitude.sudden_changes import runs_of, typical_interval_s
 from app.geometry import Array
 
 __all__ = ["StillChange", "find_changes_at_rest", "typical_gradient_uT_per_m"]
@@ -49,7 +49,7 @@ def find_changes_at_rest(
     attitude_sd_rad: float,
 ) -> list[StillChange]:
     """Changes within standstills of two seconds and more: blocks of half a second against the standstill's median."""
-    interval_s = float(np.median(np.diff(t_s)))
+    interval_s = typical_interval_s(t_s)
     block = max(2, round(BLOCK_S / interval_s))
     width = 2 * block
     ahead = np.minimum(np.arange(len(t_s)) + block, len(t_s) - 1)

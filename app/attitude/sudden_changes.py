@@ -84,9 +84,14 @@ def white_noise_sd_uT(B_uT: Array) -> float:
     return float(np.sqrt(np.median(squared) / chi2.median(B_uT.shape[1])))
 
 
+def typical_interval_s(t_s: Array) -> float:
+    """The median; at least a nanosecond, so that a log of any times has windows of a countable length."""
+    return max(float(np.median(np.diff(t_s))), 1e-9)
+
+
 def find_steps(t_s: Array, B_uT: Array, noise_sd_uT: float) -> list[Step]:
     """Steps of readings (n, c) at about even times (n,), the clearest of every neighbourhood, in order of time."""
-    interval_s = float(np.median(np.diff(t_s)))
+    interval_s = typical_interval_s(t_s)
     side = max(5, round(SIDE_S / interval_s))
     found = [
         step
@@ -142,7 +147,7 @@ def find_hum(t_s: Array, B_uT: Array, noise_sd_uT: float, known: list[tuple[int,
     `known` are samples, first and last, whose sudden changes have another name: steps, and a sensor that was stuck.
     """
     n, c = B_uT.shape
-    interval_s = float(np.median(np.diff(t_s)))
+    interval_s = typical_interval_s(t_s)
     length = max(8, round(HUM_S / interval_s))
     if n < length + ORDER:
         return []

@@ -49,10 +49,14 @@ def fit_ellipse(B_uT: Array, horizontal_uT: float) -> Ellipse:
     )
 
 
-def vertical_offset_uT(z_uT: Array, vertical_uT: float) -> tuple[float, float]:
-    """The third axis's offset from its median, with its sd; its scale is taken to be 1 (Shockley, Eq. 2.12, E4)."""
+def vertical_offset_uT(ellipse: Ellipse, vertical_uT: float) -> tuple[float, float]:
+    """The third axis's offset from its median, with its sd; its scale is taken to be 1 (Shockley, Eq. 2.12, E4).
+
+    Its noise is no less than that of the others: a sensor of coarse steps may read one and the same value throughout.
+    """
+    z_uT = ellipse.B_uT[:, 2]
     middle = float(np.median(z_uT))
-    noise = 1.4826 * float(np.median(np.abs(z_uT - middle)))
+    noise = max(1.4826 * float(np.median(np.abs(z_uT - middle))), ellipse.noise_uT)
     return middle - vertical_uT, noise * float(np.sqrt(np.pi / 2.0 / len(z_uT)))
 
 

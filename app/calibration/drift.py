@@ -16,7 +16,7 @@ from app.calibration.sensor_model import SensorModel
 from app.errors import Fault, InvalidInput
 from app.geometry import Array
 
-__all__ = ["Drift", "FieldDifference", "field_difference", "fit_drift", "sphere_directions"]
+__all__ = ["Drift", "FieldDifference", "field_difference", "fit_drift", "precision_of", "sphere_directions"]
 
 CHANCE = 0.01
 """Below this probability scatter, or a slope, is no longer put down to chance."""
@@ -74,7 +74,7 @@ def fit_drift(t_day: Sequence[float], fits: Sequence[CalibrationFit]) -> Drift:
             message = f"Calibration {k} is by {fit.method}, the first by {fits[0].method}: compare those of one method."
             raise InvalidInput(message, Fault(f"fits/{k}", "another method"))
     value = np.array([list(fit.parameters.values()) for fit in fits])
-    precision = np.array([np.linalg.inv(fit.covariance) for fit in fits])
+    precision = np.array([precision_of(fit.covariance) for fit in fits])
     t = np.asarray(t_day, dtype=np.float64)
     t = t - t.mean()
     p = len(names)
@@ -112,6 +112,15 @@ def sphere_directions(n: int) -> Array:
     angle = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(n)
     across = np.sqrt(1.0 - z**2)
     return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
+
+
+def precision_of(covariance: Array) -> Array:
+    """The inverse. Raises InvalidInput where something is said to be known for certain, of exact readings."""
+    try:
+        return np.asarray(np.linalg.inv(covariance))
+    except np.linalg.LinAlgError:
+        message = "A calibration without any uncertainty cannot be compared: calibrate from readings of a sensor."
+        raise InvalidInput(message, Fault("fits", "a singular covariance")) from None
 
 
 def _solve(basis: Array, value: Array, precision: Array) -> _Solved:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from app.calibration.drift import field_difference, sphere_directions
+from app.calibration.drift import field_difference, precision_of, sphere_directions
 from app.calibration.fit import CalibrationFit
 from app.calibration.sensor_model import SensorModel
 from app.errors import Fault, InvalidInput
@@ -87,7 +87,7 @@ def compare_calibrations(
     told = field_difference(second.model, first.model, magnitude_uT)
     off = np.array(list(second.parameters.values())) - np.array(list(first.parameters.values()))
     both = first.covariance + second.covariance
-    p_same = float(chi2.sf(off @ np.linalg.solve(both, off), len(off)))
+    p_same = float(chi2.sf(off @ precision_of(both) @ off, len(off)))
     spread = _worst_draws(second, magnitude_uT, both, first.model, rng)
     low, high = np.quantile(spread, [0.05, 0.95])
     verdict = _verdict(float(low), float(high), tolerance_uT)

@@ -33,7 +33,7 @@ def modified_ellipsoid(
     too small where rho = b^T Q b / H^2 is near 1. Raises InvalidInput with advice.
     """
     ellipse = fit_ellipse(B_uT, horizontal_uT)
-    offset_uT, offset_sd_uT = vertical_offset_uT(ellipse.B_uT[:, 2], vertical_uT)
+    offset_uT, offset_sd_uT = vertical_offset_uT(ellipse, vertical_uT)
     correction, hard_iron_uT = ellipse.correction, ellipse.hard_iron_uT
     if fit == "shockley":
         conic = fit_without_constant(ellipse.B_uT[~ellipse.outlier, :2], horizontal_uT)

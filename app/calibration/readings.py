@@ -12,6 +12,9 @@ __all__ = ["check_readings", "near_the_others"]
 GROSS = 4.0
 """Readings this many median distances from the middle of all are spikes."""
 
+MOST_STRENGTHS = 1e5
+"""Of the field, in a reading: beyond, it is no field, and its square has no digits left for one."""
+
 SATURATED_SHARE = 0.03
 SATURATED_SPREAD = 0.25
 """An axis stands at its largest or smallest value in this share of the readings, while the others move by this part of
@@ -37,6 +40,9 @@ def check_readings(B_uT: Array, reference_uT: float, least: int, axes: int = 3) 
         raise InvalidInput(message, Fault(f"B_uT/{int(np.argmax(bad))}", "not finite"))
     if len(B) < least:
         raise refusal(f"{len(B)} readings are too few: {least} are the least", ["record for longer while turning"])
+    if np.abs(B).max() > MOST_STRENGTHS * reference_uT:
+        message = f"Readings go up to {np.abs(B).max():.3g} uT, in a field of {reference_uT:g} uT. Send microtesla."
+        raise InvalidInput(message, Fault("B_uT", "no magnetic field"))
     spread = B[:, :axes].std(axis=0)
     if np.all(spread < 1e-3 * reference_uT):
         raise refusal("The readings are constant", ["turn the device while recording"])
@@ -45,9 +51,12 @@ def check_readings(B_uT: Array, reference_uT: float, least: int, axes: int = 3) 
 
 
 def near_the_others(B_uT: Array) -> NDArray[np.bool_]:
-    """(n,) false at gross spikes, which would spoil even the start of a fit. For (n, d)."""
+    """(n,) false at gross spikes, which would spoil even the start of a fit. For (n, d). Raises InvalidInput."""
     distance = np.linalg.norm(B_uT - np.median(B_uT, axis=0), axis=1)
-    return np.asarray(distance <= GROSS * np.median(distance))
+    usual = float(np.median(distance))
+    if usual == 0.0:
+        raise refusal("Half of the readings are one and the same", ["leave out what was recorded at rest"])
+    return np.asarray(distance <= GROSS * usual)
 
 
 def _refuse_saturated(B: Array, spread: Array) -> None:

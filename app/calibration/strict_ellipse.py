@@ -22,7 +22,7 @@ def strict_ellipse(B_uT: Array, horizontal_uT: float, vertical_uT: float) -> Cal
     ellipse = fit_ellipse(B_uT, horizontal_uT)
     conic = fit_without_constant(ellipse.B_uT[~ellipse.outlier, :2], horizontal_uT)
     correction = symmetric_root(conic.Q, ("use the modified ellipsoid: the hard iron is stronger than the field",))
-    offset_uT, offset_sd_uT = vertical_offset_uT(ellipse.B_uT[:, 2], vertical_uT)
+    offset_uT, offset_sd_uT = vertical_offset_uT(ellipse, vertical_uT)
     inflated = 1.0 / alpha_of(conic.Q, conic.hard_iron_uT, horizontal_uT)
     covariance = ellipse.covariance.copy()
     covariance[2:] *= inflated**0.5

@@ -48,7 +48,7 @@ def swinging(
     x, y = (_swing(ellipse, k, horizontal_uT, plain) for k in (0, 1))
     numerator = (horizontal_uT if north_uT is None else abs(north_uT)) if literal else horizontal_uT
     scale = np.array([numerator / x.half_uT, numerator / y.half_uT])
-    offset_uT, offset_sd_uT = vertical_offset_uT(ellipse.B_uT[:, 2], vertical_uT)
+    offset_uT, offset_sd_uT = vertical_offset_uT(ellipse, vertical_uT)
     scale_z = 1.0
     if literal:
         z = ellipse.B_uT[:, 2]

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.calibration.coverage import refusal
 from app.calibration.ellipsoid import ellipsoid
 from app.calibration.fit import CalibrationFit
 from app.calibration.map_aided import map_aided
@@ -87,8 +88,17 @@ def calibrate(
 
     Raises InvalidInput with advice where the readings do not determine it, NotFound, Conflict (no map yet).
     """
-    if asked.walk is not None:
-        return _on_a_map(sessions, grids, organisation_id, asked, asked.walk)
+    try:
+        if asked.walk is not None:
+            return _on_a_map(sessions, grids, organisation_id, asked, asked.walk)
+        return _by_turning(sessions, organisation_id, asked)
+    except np.linalg.LinAlgError:  # of readings that no check foresaw
+        raise refusal("The readings do not determine a calibration", []) from None
+
+
+def _by_turning(
+    sessions: sessionmaker[Session], organisation_id: str, asked: Asked
+) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
     earth = None if asked.place is None else _earth(sessions, organisation_id, asked.place)
     readings = {"b_ut": asked.B_uT}
     told: dict[str, Any] = {} if earth is None else {"model": earth.model, "date": earth.on.isoformat()}
@@ -148,6 +158,8 @@ def _on_a_map(
         noise_uT=NOISE_UT,
         device_to_frame=rotation,
     )  # fmt: skip
+    for each in maps:
+        check_vector(grids.grid(each.grid_sha256))
     found = calibrate_on_map(window, grids.searchable([(each.floor_id, each.grid_sha256) for each in maps]))
     if found.fix.status != "fix":
         reason = f"where the walk went is not found: {found.fix.reason or found.fix.status}"

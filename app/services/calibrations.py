@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Any
 
 import numpy as np
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from app.blobs import BlobStore
@@ -15,7 +15,7 @@ from app.calibration.drift import Drift, fit_drift
 from app.calibration.equivalence import EquivalentCalibrations, compare_calibrations
 from app.calibration.fit import CalibrationFit
 from app.calibration.sensor_model import SensorModel
-from app.db.tables import Calibration
+from app.db.tables import Calibration, Organisation
 from app.errors import Fault, InvalidInput, NotFound
 from app.geometry import Array
 from app.services.artefacts import pack
@@ -26,6 +26,7 @@ __all__ = [
     "compare_devices",
     "device_drift",
     "find_calibration",
+    "keep_readings",
     "model_as_json",
     "record_calibration",
     "stored_model",
@@ -91,13 +92,22 @@ def find_calibration(
     return applied(row)
 
 
+def keep_readings(blobs: BlobStore, readings: Mapping[str, Array]) -> str:
+    """The hash of the readings of a calibration, which are on disk before the row that names them."""
+    return blobs.put(pack({"kind": "calibration"}, dict(readings)))
+
+
 def record_calibration(
-    session: Session, blobs: BlobStore, organisation_id: str, *,
-    device: str, fit: CalibrationFit, reference: Mapping[str, Any], readings: Mapping[str, Array],
-    measured_at: datetime,
+    session: Session, organisation_id: str, *,
+    device: str, fit: CalibrationFit, reference: Mapping[str, Any], samples_sha256: str, measured_at: datetime,
 ) -> Calibration:  # fmt: skip
-    """Keep a calibration as the device's next version. Its readings are on disk before the row that names them."""
-    sha256 = blobs.put(pack({"kind": "calibration"}, dict(readings)))
+    """Keep a calibration as the device's next version; those of one organisation one after the other."""
+    session.execute(
+        update(Organisation)
+        .where(Organisation.id == organisation_id)
+        .values(created_at=Organisation.created_at)
+        .execution_options(synchronize_session=False)
+    )  # locks the row, so that the newest stays the newest
     newest = session.scalar(
         select(func.max(Calibration.version)).where(
             Calibration.organisation_id == organisation_id, Calibration.device == device
@@ -111,11 +121,11 @@ def record_calibration(
         model=model_as_json(fit.model),
         fit=_fit_as_json(fit),
         reference=dict(reference),
-        samples_sha256=sha256,
+        samples_sha256=samples_sha256,
         measured_at=measured_at,
     )
     session.add(row)
-    session.flush()  # two at once: the later one breaks the unique version, and is tried again
+    session.flush()
     return row
 
 

@@ -119,6 +119,12 @@ def _waypoints(trace: Trace) -> Stream:
 def _magnetometer(trace: Trace, session: str | None, correct: Callable[[Array], Array] | None) -> _Magnetometer:
     """The raw field as calibrated, or less the phone's own bias where the trace has both, else the phone's field."""
     raw, calibrated = trace.streams.get("MAGNETIC_FIELD_UNCALIBRATED"), trace.streams.get("MAGNETIC_FIELD")
+    if correct is not None and raw is None:
+        raise UnreadableSurvey(
+            "the calibration cannot be applied: the trace has no TYPE_MAGNETIC_FIELD_UNCALIBRATED, and the phone took "
+            "a bias of its own off the rest",
+            Fault("calibration", "no raw channel"),
+        )
     stream = raw or calibrated
     if stream is None or len(stream) < FEWEST_SAMPLES:
         found = 0 if stream is None else len(stream)

@@ -160,6 +160,29 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.parametrize("kind", ["map", "map_point"])
+def test_no_position_is_refused(service: Any, kind: str) -> None:
+    reference = {"kind": kind, "floor_id": "x", "position_m": []}
+    query = {
+        "t_s": [0.0, 0.02], "gyro_rad_per_s": [[0, 0, 0]] * 2, "accelerometer_m_per_s2": [[0, 0, 9.8]] * 2,
+        "magnetometer_ut": [[18, 3, -42]] * 2, "reference": reference,
+    }  # fmt: skip
+    answer = service.http.post("/v1/attitudes", json=query)
+    assert answer.status_code == 422, answer.text
+    assert "position_m" in answer.text
+
+
+@pytest.mark.parametrize("last_s", [1e11, 1e150, 1e308])
+def test_a_long_silence_has_an_answer_and_one_beyond_any_clock_is_refused(service: Any, last_s: float) -> None:
+    query = {
+        "t_s": [0.0, 1.0, last_s], "gyro_rad_per_s": [[0, 0, 0.1]] * 3, "accelerometer_m_per_s2": [[0, 0, 9.8]] * 3,
+        "reference": {"kind": "none"},
+    }  # fmt: skip
+    answer = service.http.post("/v1/attitudes", json=query)
+    assert answer.status_code == (200 if last_s <= 1e11 else 422), answer.text
+    assert answer.status_code == 422 or None not in answer.json()["yaw_sd_rad"]
+
+
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_answered_is_refused(service: Any, case: str) -> None:
     body, said = REFUSED[case]

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,13 @@ def test_the_same_request_again_makes_no_second_version(service: Any) -> None:
     assert len(service.http.get("/v1/calibrations", params={"device": "once"}).json()["items"]) == 1
 
 
+def test_many_calibrations_of_one_device_at_once_are_all_kept(service: Any) -> None:
+    with ThreadPoolExecutor(10) as threads:
+        answers = list(threads.map(lambda k: calibrate(service, device="busy", b_ut=turned(100, seed=k)), range(10)))
+    assert [answer.status_code for answer in answers] == [201] * 10
+    assert sorted(answer.json()["version"] for answer in answers) == list(range(1, 11))
+
+
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a circle is no sphere": ({"b_ut": circled()}, "axis"),
     "half of the directions": ({"b_ut": [b for b in turned() if b[0] > -20.0 and b[2] > 30.0]}, "not seen"),
@@ -99,6 +107,12 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         size=(300, 3)) ** 3).tolist()}, ""),
     "no reference": ({"reference": None}, "reference"),
     "a place that is none": ({"reference": {"latitude_deg": 10.0}}, "magnitude_ut"),
+    "half a place beside a magnitude": ({"reference": {"latitude_deg": 10.0, "magnitude_ut": 50.0}}, "longitude_deg"),
+    "two places": ({"reference": PLACE | {"building_id": "x"}}, "not both"),
+    "no time in UTC": ({"measured_at": "0001-01-01T00:00:00+14:00"}, "measured_at"),
+    "mostly at rest": ({"b_ut": [[20.0, 1.0, -40.0]] * 600 + turned(500)}, "at rest"),
+    "beyond any sensor": ({"method": "ellipsoid", "b_ut": (3e8 * np.random.default_rng(0).normal(
+        size=(100, 3))).clip(-1e9, 1e9).tolist()}, "microtesla"),
     "before the models": ({"reference": PLACE | {"date": "1999-01-01"}}, "2010"),
     "a walk for turning": ({"walk": {"floor_id": "x", "orientation": [], "position_m": []}}, "map_aided"),
     "no walk": ({"method": "map_aided"}, "walk"),
@@ -313,6 +327,21 @@ def test_a_phone_is_calibrated_by_a_walk_nobody_told_the_way_of(
         service, device="lost", method="map_aided", reference=None, walk=flat, b_ut=readings[kept].tolist()
     )
     assert answer.status_code == 422, "standing still tells nothing"
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_map_without_directions_calibrates_nothing(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], walked: Any, known: bool
+) -> None:
+    floor = new_floor()
+    service.http.post(f"/v1/floors/{floor}/surveys", params={"frame": "level"}, content=walk_csv(1))
+    service.run_jobs()
+    readings, p, q = walked(seed=3, n=100)
+    way = {"position_m": p.tolist()} if known else {"displacement_m": (p - p[0]).tolist()}
+    walk = {"floor_id": floor, "orientation": q.tolist()} | way
+    answer = calibrate(service, device="x", method="map_aided", reference=None, walk=walk, b_ut=readings.tolist())
+    assert answer.status_code == 422, answer.text
+    assert "direction" in answer.text
 
 
 def test_drift_and_equivalence(service: Any) -> None:

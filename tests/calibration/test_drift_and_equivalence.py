@@ -10,10 +10,11 @@ from scipy.stats import kstest
 from app.calibration.drift import field_difference, fit_drift, sphere_directions
 from app.calibration.ellipsoid import ellipsoid
 from app.calibration.equivalence import _moved, compare_calibrations, compare_records, pair_by_place
+from app.calibration.modified_ellipsoid import modified_ellipsoid
 from app.calibration.sensor_model import SensorModel
 from app.calibration.two_step import TWO_STEP_PARAMETERS, distortion
 from app.errors import InvalidInput
-from tests.calibration.conftest import directions
+from tests.calibration.conftest import H_UT, Z_UT, circle, directions
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +138,23 @@ def test_records_of_the_same_places_at_other_times(rng):
     assert compared.verdict == "equivalent"
     with pytest.raises(InvalidInput, match="too few"):
         compare_records(first[:4].repeat(2, 1)[:, :3], first[:4].repeat(2, 1)[:, :3], 1.0)
+
+
+def test_what_is_said_to_be_certain_cannot_be_compared(one):
+    certain = replace(one, covariance=np.zeros_like(one.covariance))
+    with pytest.raises(InvalidInput, match="without any uncertainty"):
+        compare_calibrations(certain, certain, 50.0, 1.0, np.random.default_rng(0))
+    with pytest.raises(InvalidInput, match="without any uncertainty"):
+        fit_drift(range(2), [certain, certain])
+
+
+def test_a_sensor_of_coarse_steps_can_be_compared(rng):
+    """Turned level, its z reads one and the same value throughout, of which it is not certain."""
+    fits = [
+        modified_ellipsoid(np.round((circle(np.eye(2), np.array([5.5, -7.0]), n)) / 0.15) * 0.15, H_UT, Z_UT)
+        for n in (400, 500)
+    ]
+    for fit in fits:
+        assert 0.0 < fit.parameter_sd["hard_iron_z_ut"] < 0.15
+    assert compare_calibrations(*fits, 50.0, 1.0, rng).verdict == "equivalent"
+    assert np.isfinite(fit_drift(range(2), fits).chi2)

@@ -273,6 +273,13 @@ def test_missing_sensors_are_named(known_walk, kinds, reason):
     assert reason in str(refused(without(known_walk.text, *kinds).encode()))
 
 
+def test_a_calibration_is_of_the_raw_channel_alone(known_walk):
+    """The phone's own field has its bias taken off already, and which one is not known."""
+    data = without(known_walk.text, "MAGNETIC_FIELD_UNCALIBRATED").encode()
+    with pytest.raises(UnreadableSurvey, match="TYPE_MAGNETIC_FIELD_UNCALIBRATED"):
+        read_survey(data, format="indoor-location-2020", correct=lambda B_uT: B_uT - 5.0)
+
+
 def test_other_refusals(known_walk):
     assert "empty" in str(refused(b" \n"))
     assert "no trace" in str(refused(b"t_s,x_m\n1,2\n"))
