@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from app.api.auth import Calibrating, Measuring
 from app.api.calibration_request import Method, NewCalibration
 from app.api.context import ContextDep
-from app.api.idempotency import IdempotencyKey, RawBody, answer_once
+from app.api.idempotency import IdempotencyKey, RawBody, answer_once, answered_before
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Name
 from app.api.ownership import find_own
@@ -121,6 +121,9 @@ async def create_calibration(
         )  # fmt: skip
         return 201, show_calibration(row)
 
+    earlier = await run_in_threadpool(answered_before, context, identity, request, key, raw)
+    if earlier is not None:
+        return earlier
     # A search of its own, so in turn with those for positions; it and its readings before the transaction.
     fit, reference, readings = await asyncio.get_running_loop().run_in_executor(
         context.searches, calibrate, context.sessions, context.grids, identity.organisation_id, body.asked()

@@ -16,7 +16,7 @@ from app.db.tables import Idempotency
 from app.errors import Conflict
 from app.services.manage_keys import Identity
 
-__all__ = ["IdempotencyKey", "RawBody", "answer_once"]
+__all__ = ["IdempotencyKey", "RawBody", "answer_once", "answered_before"]
 
 IdempotencyKey = Annotated[
     str | None,
@@ -47,7 +47,7 @@ def answer_once(
 
     Raises Conflict when the key was used for a different request.
     """
-    fingerprint = sha256(f"{request.method} {request.url.path}?{request.url.query}\n".encode() + body).hexdigest()
+    fingerprint = _fingerprint(request, body)
     for attempt in (1, 2):
         try:
             with context.transaction() as session:
@@ -73,6 +73,24 @@ def answer_once(
             if attempt == 2:
                 raise
     raise AssertionError("unreachable")
+
+
+def answered_before(
+    context: Context, identity: Identity, request: Request, key: str | None, body: bytes
+) -> JSONResponse | None:
+    """The answer that was given to this request already, before anything is worked out for it again.
+
+    Raises Conflict when the key was used for a different request.
+    """
+    if key is None:
+        return None
+    with context.transaction() as session:
+        earlier = session.get(Idempotency, (identity.organisation_id, key))
+        return None if earlier is None else _again(earlier, _fingerprint(request, body))
+
+
+def _fingerprint(request: Request, body: bytes) -> str:
+    return sha256(f"{request.method} {request.url.path}?{request.url.query}\n".encode() + body).hexdigest()
 
 
 def _again(earlier: Idempotency, fingerprint: str) -> JSONResponse:

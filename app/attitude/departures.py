@@ -32,6 +32,7 @@ MOST_OF_WALK = 0.5
 """A walk that departs longer than this departs from the whole map, which is no stretch."""
 
 REVISIT_M, REVISIT_S = 0.6, 15.0
+STAY_M, STAY_S = 0.01, 1.0
 """Places this near are the same; visits this far apart in time are different ones."""
 
 
@@ -146,15 +147,27 @@ def _variance_of_mean(count: Array, length_m: Array, structure: ErrorStructure) 
     return np.asarray(structure.walk_share * walk + structure.white_share / count + 0.1 * structure.constant_share)
 
 
+def _first_of_stays(t_s: Array, p_building_m: Array) -> NDArray[np.intp]:
+    """Indices of samples (m,) of which none is within a centimetre and STAY_S of the one before: standing still, a
+    device reads its place over and over, and every reading would be compared with every other."""
+    kept = [0]
+    for k in range(1, len(t_s)):
+        last = kept[-1]
+        if t_s[k] - t_s[last] >= STAY_S or np.abs(p_building_m[k] - p_building_m[last]).max() > STAY_M:
+            kept.append(k)
+    return np.array(kept, dtype=np.intp)
+
+
 def expected_from_other_visits(
     t_s: Array, p_building_m: Array, B_uT: Array, noise_sd_uT: float, gradient_uT_per_m: float, attitude_sd_rad: float
 ) -> Expected:
     """What the other visits of each place in the same walk lead one to expect there: the reading nearest to it."""
     mean, sd = np.full(B_uT.shape, np.nan), np.full(B_uT.shape, np.nan)
-    tree = cKDTree(p_building_m)
     floor = attitude_sd_rad * float(np.median(np.linalg.norm(B_uT, axis=1)))
+    first = _first_of_stays(t_s, p_building_m)
+    tree = cKDTree(p_building_m[first])
     for k, place in enumerate(p_building_m):
-        near = np.array(tree.query_ball_point(place, REVISIT_M), dtype=np.intp)
+        near = first[np.array(tree.query_ball_point(place, REVISIT_M), dtype=np.intp)]
         others = near[np.abs(t_s[near] - t_s[k]) > REVISIT_S]
         if len(others):
             away = np.linalg.norm(p_building_m[others] - p_building_m[k], axis=1)

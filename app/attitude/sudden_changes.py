@@ -35,6 +35,7 @@ AROUND_S = 1.2
 STUCK_SHARE = 0.1
 """Of what the magnitude's noise differs by between two readings: less, and they are one reading given twice."""
 STUCK_READINGS = 7
+REPEATS_CHANCE = 1e-4
 
 ORDER = 5
 _BINOMIALS = comb(ORDER, np.arange(ORDER + 1)) * (-1.0) ** np.arange(ORDER + 1)
@@ -172,9 +173,14 @@ def find_hum(t_s: Array, B_uT: Array, noise_sd_uT: float, known: list[tuple[int,
 
 
 def find_stuck(B_uT: Array, noise_sd_uT: float) -> list[tuple[int, int]]:
-    """Start and stop (excluded) of stretches that repeat one reading, however the device turns meanwhile."""
+    """Start and stop (excluded) of stretches that repeat one reading, however the device turns meanwhile.
+
+    A sensor of coarse steps repeats itself all the time: a run has to be longer than chance makes any in the walk.
+    """
     repeated = np.abs(np.diff(np.linalg.norm(B_uT, axis=1))) < STUCK_SHARE * np.sqrt(2.0) * noise_sd_uT
-    return [(a, b + 1) for a, b in runs_of(repeated) if b + 1 - a >= STUCK_READINGS]
+    share = float(np.clip(repeated.mean(), 1e-9, 1.0 - 1e-6)) if len(repeated) else 0.5
+    by_chance = np.log(REPEATS_CHANCE / max(len(repeated), 1)) / np.log(share)
+    return [(a, b + 1) for a, b in runs_of(repeated) if b + 1 - a >= max(STUCK_READINGS, by_chance)]
 
 
 def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

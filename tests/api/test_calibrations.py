@@ -88,6 +88,11 @@ def test_the_same_request_again_makes_no_second_version(service: Any) -> None:
     assert first.status_code == 201, first.text
     assert first.json() == again.json()
     assert len(service.http.get("/v1/calibrations", params={"device": "once"}).json()["items"]) == 1
+    blobs = service.blob_count()
+    assert service.http.post("/v1/calibrations", json=asked, headers=key).headers["Idempotent-Replayed"] == "true"
+    assert service.blob_count() == blobs
+    other = service.http.post("/v1/calibrations", json=asked | {"device": "another"}, headers=key)
+    assert other.status_code == 409
 
 
 def test_many_calibrations_of_one_device_at_once_are_all_kept(service: Any) -> None:

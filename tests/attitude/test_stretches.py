@@ -108,6 +108,13 @@ def test_a_sensor_that_repeats_itself_is_stuck_and_what_follows_is_no_step():
     assert found[0].end_s == pytest.approx(21.1, abs=0.2)
 
 
+def test_a_sensor_of_coarse_steps_is_not_stuck():
+    """A phone's steps are 0.15 uT, an old one's a whole microtesla: it repeats readings because it cannot do other."""
+    t, p, B = loop_walk(3)
+    for step_uT in (0.15, 1.0):
+        assert kinds(find_disturbed_stretches(t, np.round(B / step_uT) * step_uT, p)) == []
+
+
 def test_a_trolley_that_passes_while_the_device_stands_still():
     t, p, B = loop_walk(5, laps=0.9, rest=150)
     B += 20.0 * np.exp(-0.5 * ((t - 25.0) / 1.5) ** 2)[:, None] * [0.6, -0.6, 0.5]
