@@ -129,7 +129,7 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
         "spec": spec,
         "grid_sha256": blobs.put(grid_to_bytes(fitted.grid)),
         "layers_sha256": blobs.put(layers_to_bytes(fitted.layers)) if fitted.layers else None,
-        "quality_sha256": blobs.put(_quality_bytes(fitted, changes, walks)),
+        "quality_sha256": blobs.put(_quality_bytes(fitted, changes, walks, excluded)),
         "components": fitted.grid.components,
         "bounds_m": list(fitted.grid.bounds_m),
         "hyperparameters": fitted.hyperparameters,
@@ -258,7 +258,7 @@ def _wanted_surveys(session: Session, floor_id: str, map_row: Map) -> list[str]:
     return list(session.scalars(wanted))
 
 
-def _quality_bytes(fitted: FittedMap, changes: Result, walks: Mapping[str, Samples]) -> bytes:
+def _quality_bytes(fitted: FittedMap, changes: Result, walks: Mapping[str, Samples], excluded_s: Excluded) -> bytes:
     quality: Mapping[str, Any] = {
         "score": asdict(fitted.score) if fitted.score else None,
         "score_reason": fitted.score_reason,
@@ -269,6 +269,7 @@ def _quality_bytes(fitted: FittedMap, changes: Result, walks: Mapping[str, Sampl
         "error_structure": asdict(fitted.grid.error_structure),
         "surveys": {survey_id: asdict(report) for survey_id, report in fitted.consistency.items()},
         "disturbances": _disturbances(fitted, walks),
+        "excluded_s": dict(excluded_s),
         "changes": changes,
         "hard_iron": fitted.hard_iron,
         "refinement": fitted.hyperparameters.get("refinement"),

@@ -107,3 +107,4 @@ def test_a_survey_of_which_nothing_is_left_is_left_out(
     active = service.http.get(f"/v1/floors/{floor}").json()["active_map_id"]
     quality = service.http.get(f"/v1/maps/{active}/quality").json()
     assert set(quality["surveys"]) == {first}
+    assert quality["excluded_s"] == {second: [[-1.0, 1e6]]}
