@@ -22,7 +22,7 @@ from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Calibration
 from app.services.calibrate import calibrate
-from app.services.calibrations import compare_devices, device_drift, record_calibration
+from app.services.calibrations import compare_devices, device_drift, record_calibration, store_readings
 
 __all__ = ["router"]
 
@@ -116,8 +116,8 @@ async def create_calibration(
 
     def create(session: Session) -> tuple[int, BaseModel]:
         row = record_calibration(
-            session, context.blobs, identity.organisation_id, device=body.device, fit=fit, reference=reference,
-            readings=readings, measured_at=body.measured_at or datetime.now(UTC),
+            session, identity.organisation_id, device=body.device, fit=fit, reference=reference,
+            readings_sha256=readings_sha256, measured_at=body.measured_at or datetime.now(UTC),
         )  # fmt: skip
         return 201, show_calibration(row)
 
@@ -125,6 +125,7 @@ async def create_calibration(
     fit, reference, readings = await asyncio.get_running_loop().run_in_executor(
         context.searches, calibrate, context.sessions, context.grids, identity.organisation_id, body.asked()
     )
+    readings_sha256 = await run_in_threadpool(store_readings, context.blobs, readings)
     return await run_in_threadpool(partial(answer_once, context, identity, request, key, raw, create))
 
 

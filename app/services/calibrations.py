@@ -28,6 +28,7 @@ __all__ = [
     "find_calibration",
     "model_as_json",
     "record_calibration",
+    "store_readings",
     "stored_model",
 ]
 
@@ -91,13 +92,16 @@ def find_calibration(
     return applied(row)
 
 
+def store_readings(blobs: BlobStore, readings: Mapping[str, Array]) -> str:
+    """Keep a calibration's readings, before the transaction that names them: a slow store must hold up nobody else."""
+    return blobs.put(pack({"kind": "calibration"}, dict(readings)))
+
+
 def record_calibration(
-    session: Session, blobs: BlobStore, organisation_id: str, *,
-    device: str, fit: CalibrationFit, reference: Mapping[str, Any], readings: Mapping[str, Array],
-    measured_at: datetime,
+    session: Session, organisation_id: str, *,
+    device: str, fit: CalibrationFit, reference: Mapping[str, Any], readings_sha256: str, measured_at: datetime,
 ) -> Calibration:  # fmt: skip
-    """Keep a calibration as the device's next version. Its readings are on disk before the row that names them."""
-    sha256 = blobs.put(pack({"kind": "calibration"}, dict(readings)))
+    """Keep a calibration as the device's next version; its readings were stored before (`store_readings`)."""
     newest = session.scalar(
         select(func.max(Calibration.version)).where(
             Calibration.organisation_id == organisation_id, Calibration.device == device
@@ -111,7 +115,7 @@ def record_calibration(
         model=model_as_json(fit.model),
         fit=_fit_as_json(fit),
         reference=dict(reference),
-        samples_sha256=sha256,
+        samples_sha256=readings_sha256,
         measured_at=measured_at,
     )
     session.add(row)
