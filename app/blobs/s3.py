@@ -165,15 +165,18 @@ class S3BlobStore:
         """
         try:
             yield
-        except (PermissionDeniedError, UnauthenticatedError) as error:
-            raise Unavailable(
-                f"the blob store {self._address} refuses its key: it needs s3:GetObject, s3:PutObject, s3:DeleteObject "
-                "and s3:ListBucket there (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_SESSION_TOKEN)"
-            ) from error
         except (BaseError, OSError) as error:
             said = str(error)
             if isinstance(error, FileNotFoundError) and (not told_why or "<Code>NoSuchKey</Code>" in said):
                 raise
+            # A refused listing has no error of its own.
+            refused = isinstance(error, (PermissionDeniedError, UnauthenticatedError))
+            if refused or "status code: 403" in said or "status code: 401" in said:
+                raise Unavailable(
+                    f"the blob store {self._address} refuses its key: it needs s3:GetObject, s3:PutObject, "
+                    "s3:DeleteObject and s3:ListBucket there (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, "
+                    "AWS_SESSION_TOKEN)"
+                ) from error
             if "<Code>NoSuchBucket</Code>" in said:
                 raise Unavailable(
                     f"the blob store {self._address} is not there: make the bucket {self._bucket}, or correct "

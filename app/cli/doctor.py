@@ -124,7 +124,7 @@ def _blobs(settings: Settings) -> Iterator[Finding]:
         store.get(sha256)
         store.discard(sha256)
     except Unavailable as error:
-        cause = str(error.__cause__).splitlines()[0][:200]
+        cause = str(error.__cause__).splitlines()[0][:400]
         yield Finding("blob store", False, f"{url}: {cause}", str(error))
         return
     except InvalidInput as error:
