@@ -17,9 +17,11 @@ from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
 from pathlib import Path
 from statistics import median
+from typing import TypeVar
 
 from app.blobs import BlobStore, FolderBlobStore, open_blob_store
 
+A, B = TypeVar("A"), TypeVar("B")
 SIZES = {"10 kB": 10_000, "1 MB": 1_000_000, "20 MB": 20_000_000}
 MOST_ROUNDS, BUDGET_S = 50, 4.0  # of each size, both stores
 
@@ -40,8 +42,8 @@ def compare(stores: dict[str, BlobStore], label: str, size: int) -> bool:
     while rounds < MOST_ROUNDS and time.perf_counter() < until:
         data = os.urandom(size)
         for name, store in stores.items():
-            put_s, sha256 = timed(lambda store=store: store.put(data))
-            get_s, got = timed(lambda store=store, sha256=sha256: store.get(sha256))
+            put_s, sha256 = timed(store.put, data)
+            get_s, got = timed(store.get, sha256)
             assert got == data, (name, label)
             store.discard(sha256)
             took.setdefault(("put", name), []).append(put_s)
@@ -53,9 +55,9 @@ def compare(stores: dict[str, BlobStore], label: str, size: int) -> bool:
     return rounds > 0
 
 
-def timed(work: Callable[[], object]) -> tuple[float, object]:
+def timed(work: Callable[[A], B], on: A) -> tuple[float, B]:
     begun = time.perf_counter()
-    made = work()
+    made = work(on)
     return time.perf_counter() - begun, made
 
 
