@@ -21,7 +21,8 @@ from typing import TypeVar
 
 from app.blobs import BlobStore, FolderBlobStore, open_blob_store
 
-A, B = TypeVar("A"), TypeVar("B")
+A = TypeVar("A")
+B = TypeVar("B")
 SIZES = {"10 kB": 10_000, "1 MB": 1_000_000, "20 MB": 20_000_000}
 MOST_ROUNDS, BUDGET_S = 50, 4.0  # of each size, both stores
 
