@@ -9,6 +9,7 @@
     * Conflict                  the object's present state forbids it                       (HTTP 409)
     * TooLarge                  more bytes or samples than the limit                        (HTTP 413)
     * TooMany                   more requests or tracks than the limit, for now             (HTTP 429)
+    * Unavailable               what Isodyn itself depends on cannot be reached, for now     (HTTP 503)
     * JobCancelled              a job was asked to stop, and did
     * CorruptArtefact           stored bytes do not match their hash or their format
 
@@ -29,6 +30,7 @@ __all__ = [
     "NotFound",
     "TooLarge",
     "TooMany",
+    "Unavailable",
     "UnreadableSurvey",
 ]
 
@@ -81,6 +83,14 @@ class TooMany(IsodynError):
     """More than the limit, for now; `retry_after_s` says when it may do, where that is known."""
 
     def __init__(self, message: str, *faults: Fault, retry_after_s: float | None = None) -> None:
+        super().__init__(message, *faults)
+        self.retry_after_s = retry_after_s
+
+
+class Unavailable(IsodynError):
+    """What Isodyn itself depends on cannot be reached, for now; `retry_after_s` says when to try again."""
+
+    def __init__(self, message: str, *faults: Fault, retry_after_s: float = 5.0) -> None:
         super().__init__(message, *faults)
         self.retry_after_s = retry_after_s
 

@@ -17,7 +17,9 @@ class Settings(BaseSettings):
     database_url: str | None = Field(
         default=None, description="default: SQLite in the data folder; or postgresql+psycopg://"
     )
-    blob_url: str | None = Field(default=None, description="default: a folder in the data folder; a file:// address")
+    blob_url: str | None = Field(
+        default=None, description="default: a folder in the data folder; or s3://BUCKET/PREFIX"
+    )
     admin_key: str | None = Field(
         default=None, description="the admin key; else one is made at first start and printed once"
     )

@@ -25,6 +25,7 @@ from app.db.tables import Building, Floor, Map, Organisation
 from app.field.error_structure import ErrorStructure
 from app.field.grid import FieldGrid
 from app.services.artefacts import grid_to_bytes
+from tests.s3_server import ENVIRONMENT, Server, started
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -194,6 +195,25 @@ def postgres_url() -> Iterator[str]:
         with server.connect() as connection:
             connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
         server.dispose()
+
+
+@pytest.fixture(scope="session")
+def s3_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server of the S3 API with a bucket, for all tests of this process."""
+    server = started(tmp_path_factory.mktemp("s3") / "server.log")
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def s3(s3_server: Server) -> Iterator[Server]:
+    """The same, and the environment leads there."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [name for name in os.environ if name.startswith("AWS_")]:
+            patch.delenv(name)
+        for name, value in {**ENVIRONMENT, "AWS_ENDPOINT_URL": s3_server.url}.items():
+            patch.setenv(name, value)
+        yield s3_server
 
 
 @pytest.fixture(scope="module", params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])

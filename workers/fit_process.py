@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import IO, Any
 
-from app.errors import IsodynError, JobCancelled
+from app.errors import IsodynError, JobCancelled, Unavailable
 from workers.builder import Plan, Result, load_builder
 
 __all__ = ["FitFailed", "FitProcessDied", "run_fit"]
@@ -42,7 +42,8 @@ def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress, silence_s
     """Run `fit_build` of the module `builder` in a child process and return its result.
 
     `report` is called from this thread with the last progress, also while the fit is silent; what it raises stops
-    the child. A fit that makes no progress for `silence_s` counts as dead. Raises FitFailed, FitProcessDied.
+    the child. A fit that makes no progress for `silence_s` counts as dead. Raises FitFailed, FitProcessDied, and
+    Unavailable where the child could not reach its blobs.
     """
     child = subprocess.Popen(
         [sys.executable, "-m", "workers.fit_process"],
@@ -71,6 +72,8 @@ def _listen(child: subprocess.Popen[bytes], report: Progress, silence_s: float) 
         if "result" in said:
             result: Result = said["result"]
             return result
+        if "unavailable" in said:
+            raise Unavailable(said["unavailable"])
         if "error" in said:
             raise FitFailed(said["error"])
         fraction, message = said["fraction"], said["message"]
@@ -164,6 +167,9 @@ def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
         builder = load_builder(order["builder"])
         with threadpool_limits(1):
             return {"result": builder.fit_build(order["plan"], open_blob_store(order["blob_url"]), progress)}
+    except Unavailable as error:
+        logging.getLogger(__name__).warning("%s: %s", error, error.__cause__)
+        return {"unavailable": str(error)}
     except IsodynError as error:
         return {"error": str(error)}
     except Exception as error:

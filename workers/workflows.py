@@ -7,6 +7,7 @@ Whatever ends a step on purpose is in its outcome, because an exception comes ba
 """
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
@@ -18,7 +19,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import BUILD, REBUILD, Job
-from app.errors import IsodynError, JobCancelled, NotFound
+from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, claim_generation, lock_floor
 from workers.builder import Builder, Plan, Result
@@ -28,6 +29,7 @@ __all__ = ["WorkflowContext", "register_workflows"]
 
 FIT_ATTEMPTS = 3
 DATABASE_ATTEMPTS = 8  # a second, two, four ...: two minutes in all
+BLOB_WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # a store that cannot be reached: two minutes in all, too
 MOST_RECOVERIES = 10  # a job that takes its worker down with it must not do so for ever
 
 Outcome = dict[str, Any]
@@ -106,11 +108,24 @@ class _Steps:
             return {"cancelled": True}
         reporter = JobReporter(self._context.sessions, job_id, still_owner=_stop_unless_owner)
         try:
-            return {"result": run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)}
+            return {"result": self._fit_once_blobs_are_reached(plan, reporter)}
         except JobCancelled:
             return {"cancelled": True}
-        except FitFailed as error:
+        except (FitFailed, Unavailable) as error:
             return {"failed": str(error)}
+
+    def _fit_once_blobs_are_reached(self, plan: Plan, reporter: JobReporter) -> Result:
+        """Raises Unavailable where the blob store stays away for the whole wait."""
+        for wait_s in BLOB_WAITS_S:
+            try:
+                return run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)
+            except Unavailable as error:
+                log.warning("a fit waits %.0f s: %s", wait_s, error)
+                until = time.monotonic() + wait_s
+            while time.monotonic() < until:
+                reporter.report(0.0, "waiting for the blob store")  # and may be cancelled meanwhile
+                time.sleep(0.25)
+        return run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)

@@ -9,7 +9,7 @@
 | conflict     | 409 | the object's present state forbids it                                                     |
 | too-large    | 413 | more bytes than the limit                                                                 |
 | too-many     | 429 | more tracks, or steps a second, than the limit; Retry-After says when                      |
-| unavailable  | 503 | the database or the blob store cannot be reached                                          |
+| unavailable  | 503 | the database or the blob store cannot be reached; Retry-After says when to try again      |
 """
 
 import logging
@@ -35,6 +35,7 @@ from app.errors import (
     NotFound,
     TooLarge,
     TooMany,
+    Unavailable,
     UnreadableSurvey,
 )
 
@@ -75,6 +76,7 @@ _KINDS: dict[type[IsodynError], tuple[int, str, str]] = {
     Conflict: (409, "conflict", "The object's state forbids it"),
     TooLarge: (413, "too-large", "Too large"),
     TooMany: (429, "too-many", "Too many"),
+    Unavailable: (503, "unavailable", "Unavailable"),
     CorruptArtefact: (500, "corrupt-artefact", "Stored data is damaged"),
     IsodynError: (500, "internal", "Something went wrong here"),
 }
@@ -108,7 +110,7 @@ ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
     409: _documented("The object's present state forbids it"),
     413: _documented("More bytes than the limit"),
     422: _documented("What was sent cannot be used; `errors` says where and why"),
-    503: _documented("The database or the blob store cannot be reached; try again"),
+    503: _documented("The database or the blob store cannot be reached; try again after Retry-After"),
 }
 
 TOO_MANY: dict[int | str, dict[str, Any]] = {429: _documented("More than the limit for now; see Retry-After")}
@@ -142,7 +144,7 @@ def isodyn_problem(error: IsodynError) -> JSONResponse:
     """The problem document of an error of the tree."""
     status, kind, title = next(_KINDS[cls] for cls in type(error).__mro__ if cls in _KINDS)
     headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
-    if isinstance(error, TooMany) and error.retry_after_s is not None:
+    if isinstance(error, (TooMany, Unavailable)) and error.retry_after_s is not None:
         headers = {"Retry-After": str(max(ceil(error.retry_after_s), 1))}
     return problem_response(status, kind, title, str(error), error.faults, headers)
 
@@ -150,7 +152,9 @@ def isodyn_problem(error: IsodynError) -> JSONResponse:
 async def _isodyn_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, IsodynError)
     answer = isodyn_problem(error)
-    if answer.status_code >= 500:
+    if isinstance(error, Unavailable):
+        _log.warning("%s %s: %s: %s", request.method, request.url.path, error, error.__cause__)
+    elif answer.status_code >= 500:
         _tell_the_log(request, error)
     return answer
 

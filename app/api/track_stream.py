@@ -26,7 +26,7 @@ from app.api.context import Context
 from app.api.problems import Forbidden, Unauthorised, isodyn_problem, problem_response, validation_problem
 from app.api.track_answer import steps_answer
 from app.api.track_request import MOST_STEPS, StepsBody, raw_steps
-from app.errors import Conflict, Fault, InvalidInput, IsodynError, NotFound
+from app.errors import Conflict, Fault, InvalidInput, IsodynError, NotFound, Unavailable
 from app.services.follow import Outcome
 from app.services.step_order import RawStep
 from app.services.track_spec import StepKind
@@ -41,6 +41,7 @@ MOST_AHEAD_BYTES = 2**20
 """Read ahead of the batch in work: minutes of a fast device's steps. The server's own queue, and TCP's, come after."""
 _CLOSES: dict[type[IsodynError], int] = {
     Unauthorised: CLOSE_UNAUTHORISED, Forbidden: CLOSE_UNAUTHORISED, NotFound: CLOSE_NOT_FOUND, Conflict: CLOSE_ENDED,
+    Unavailable: CLOSE_UNAVAILABLE,
 }  # fmt: skip
 
 

@@ -4,17 +4,20 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from app.blobs.folder import FolderBlobStore
+from app.blobs.s3 import S3BlobStore
 from app.blobs.store import BlobStore, StoredBlob
 from app.errors import InvalidInput
 
-__all__ = ["BlobStore", "FolderBlobStore", "StoredBlob", "open_blob_store"]
+__all__ = ["BlobStore", "FolderBlobStore", "S3BlobStore", "StoredBlob", "open_blob_store"]
 
 
 def open_blob_store(url: str) -> BlobStore:
-    """The store at a `file://` address. Raises InvalidInput for addresses that are not offered."""
+    """The store at a `file://` or `s3://` address. Raises InvalidInput for addresses that are not offered."""
     parts = urlsplit(url)
     if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path.startswith("/"):
         return FolderBlobStore(Path(unquote(parts.path)))
     if parts.scheme == "s3":
-        raise InvalidInput(f"blob address {url!r}: s3:// is not offered yet; use file:///FOLDER")
-    raise InvalidInput(f"blob address {url!r} cannot be read: use file:///FOLDER with an absolute path")
+        return S3BlobStore(url)
+    raise InvalidInput(
+        f"blob address {url!r} cannot be read: use file:///FOLDER with an absolute path, or s3://BUCKET/PREFIX"
+    )

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from app.cli.environment import read_settings
+from app.errors import InvalidInput, Unavailable
 from app.settings import Settings
 
 __all__ = ["Finding", "doctor", "examine"]
@@ -116,10 +117,20 @@ def _blobs(settings: Settings) -> Iterator[Finding]:
 
     if settings.blob_url is None and not settings.data_dir.exists():
         return
-    store = open_blob_store(settings.resolved_blob_url)
-    probe = b"isodyn doctor"
-    ok = store.get(store.put(probe)) == probe
-    yield Finding("blob store", ok, settings.resolved_blob_url)
+    url = settings.resolved_blob_url
+    try:
+        store = open_blob_store(url)
+        sha256 = store.put(b"isodyn doctor " + os.urandom(8))  # nobody else's, and can go again
+        store.get(sha256)
+        store.discard(sha256)
+    except Unavailable as error:
+        cause = str(error.__cause__).splitlines()[0][:400]
+        yield Finding("blob store", False, f"{url}: {cause}", str(error))
+        return
+    except InvalidInput as error:
+        yield Finding("blob store", False, "no address of a blob store", str(error))
+        return
+    yield Finding("blob store", True, f"{url}: written, read and cleaned")
 
 
 def _port(settings: Settings) -> Iterator[Finding]:

@@ -93,7 +93,7 @@ def find_calibration(
 
 
 def keep_readings(blobs: BlobStore, readings: Mapping[str, Array]) -> str:
-    """The hash of the readings of a calibration, which are on disk before the row that names them."""
+    """Keep a calibration's readings, before the transaction that names them: a slow store must hold up nobody else."""
     return blobs.put(pack({"kind": "calibration"}, dict(readings)))
 
 

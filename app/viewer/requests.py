@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from app.errors import Conflict, Fault, InvalidInput, IsodynError, NotFound, TooLarge
+from app.errors import Conflict, Fault, InvalidInput, IsodynError, NotFound, TooLarge, Unavailable
 
 __all__ = ["SECURITY_HEADERS", "foreign_fetch", "problem", "read_form", "read_json", "refusal", "same_origin"]
 
@@ -77,6 +77,7 @@ _STATUS: dict[type[IsodynError], HTTPStatus] = {
     NotFound: HTTPStatus.NOT_FOUND,
     Conflict: HTTPStatus.CONFLICT,
     TooLarge: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    Unavailable: HTTPStatus.SERVICE_UNAVAILABLE,
     InvalidInput: HTTPStatus.UNPROCESSABLE_ENTITY,
 }
 

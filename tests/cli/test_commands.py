@@ -107,7 +107,7 @@ def test_openapi_is_written(data_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value", "said"),
-    [("PORT", "99999", "ISODYN_PORT"), ("BLOB_URL", "s3://bucket", "s3"), ("DATABASE_URL", "mysql://x/y", "mysql")],
+    [("PORT", "99999", "ISODYN_PORT"), ("BLOB_URL", "s3://", "s3"), ("DATABASE_URL", "mysql://x/y", "mysql")],
 )
 def test_a_wrong_setting_is_one_sentence(
     data_dir: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, said: str

@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from app.blobs import BlobStore, FolderBlobStore
+from app.blobs import BlobStore
 from app.db.tables import Floor, Job, Map, Survey
 from app.errors import InvalidInput
 
@@ -59,7 +59,6 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
 
 def fit_build(plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None]) -> dict[str, Any]:
     note("fit starts", floor_id=plan["floor_id"], map_id=plan["map_id"], surveys=plan["surveys"])
-    assert isinstance(blobs, FolderBlobStore)
     if plan.get("fail"):
         raise InvalidInput("the walks do not overlap; walk the floor again")
     if plan.get("break"):
