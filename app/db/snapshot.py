@@ -12,6 +12,7 @@ from app.db.engine import (
     migration_lock,
     prepare_sqlite_file,
 )
+from app.errors import Conflict
 
 __all__ = ["known_revisions", "made_at_once", "move_schema", "snapshot"]
 
@@ -52,7 +53,10 @@ def made_at_once(engine: Engine) -> Iterator[Connection]:
 
 
 def move_schema(connection: Connection, revision: str) -> None:
-    """Bring our schema from whatever revision to this one, up or down, in the connection's transaction."""
+    """Bring our schema from whatever revision to this one, up or down, in the connection's transaction.
+
+    Raises Conflict where it is at a revision that this version does not know.
+    """
     from alembic import command
     from alembic.runtime.migration import MigrationContext
 
@@ -60,6 +64,8 @@ def move_schema(connection: Connection, revision: str) -> None:
     config.attributes["connection"] = connection
     known = known_revisions()
     at = MigrationContext.configure(connection).get_current_revision()
+    if at is not None and at not in known:
+        raise Conflict(f"the database is at schema {at}, which this program does not know: it is of a newer version")
     if at is not None and known.index(at) > known.index(revision):
         command.downgrade(config, revision)
     else:

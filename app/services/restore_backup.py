@@ -45,8 +45,9 @@ def restore_backup(database_url: str, blobs: BlobStore, path: Path, progress: Pr
         with ArchiveReader(path) as archive:
             manifest = archive.manifest
             _check_revision(manifest)
-            with engine.connect() as connection:
-                _check_empty(connection)
+            if engine.dialect.name != "sqlite" or Path(str(engine.url.database)).exists():
+                with engine.connect() as connection:
+                    _check_empty(connection)
             archive.verify(progress)
             _put_blobs(archive, blobs, progress)
             rows, jobs = _fill(engine, archive, progress)
@@ -89,7 +90,6 @@ def _fill(engine: Engine, archive: ArchiveReader, progress: Progress) -> tuple[i
             _check_empty(connection)
             if queue.knows_jobs():
                 raise Conflict("the database has jobs of another installation in its job engine; give a new database")
-            move_schema(connection, "base")
             move_schema(connection, archive.manifest.revision)
             rows = _insert(connection, archive, progress)
             progress("migrating", 0, 1)
