@@ -14,7 +14,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from struct import error as StructError
@@ -97,7 +97,10 @@ class ArchiveWriter:
             if kind is None:
                 self._finish()
         finally:
-            self._file.close()
+            with suppress(Exception):  # given up: whether its end could be written does not matter any more
+                self._zip.close()
+            with suppress(OSError):
+                self._file.close()
             self._temporary.unlink(missing_ok=True)
 
     def add(self, name: str, parts: Iterable[bytes], *, packed: bool = False) -> None:

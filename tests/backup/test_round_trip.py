@@ -82,7 +82,8 @@ def test_every_table_is_in_a_backup_or_known_to_stay_out(site: Any, tmp_path: Pa
     with ArchiveReader(tmp_path / "1.zip") as archive:
         assert set(archive.manifest.tables) | LEFT_OUT == set(Base.metadata.tables)
         assert archive.manifest.program == __version__
-    names = zipfile.ZipFile(tmp_path / "1.zip").namelist()
+    with zipfile.ZipFile(tmp_path / "1.zip") as members:
+        names = members.namelist()
     assert names[-1] == "manifest.json", "written last"
 
 
