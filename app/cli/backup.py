@@ -68,6 +68,7 @@ def clean(
         "24h"
     ),
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be deleted, and delete nothing")] = False,
+    even_most: Annotated[bool, typer.Option("--even-most", help="also where that is most of the store")] = False,
 ) -> None:
     """Delete the blobs that nothing names any more: of deleted surveys, former plans, uploads that broke off."""
     from app.cli.installation import open_installation, progress_bar
@@ -75,7 +76,7 @@ def clean(
 
     age = _duration(older_than)
     with say_refusals(), open_installation(read_settings()) as here, progress_bar() as progress:
-        done = clean_blobs(here.sessions, here.queue, here.blobs, age, dry_run, progress)
+        done = clean_blobs(here.sessions, here.queue, here.blobs, age, dry_run, progress, even_most)
     verb = "would be deleted" if dry_run else "deleted"
     print(f"{done.blobs:,} blobs {verb}, {done.size_bytes:,} bytes; {done.kept:,} that nothing names are younger")
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -18,6 +19,8 @@ from app.services.backup_archive import Progress as Report
 from app.settings import Settings
 
 __all__ = ["Installation", "open_installation", "progress_bar"]
+
+EVERY_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +59,15 @@ def progress_bar() -> Iterator[Report]:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as shown:
         tasks: dict[str, TaskID] = {}
+        shown_s = 0.0
 
         def report(what: str, done: int, total: int) -> None:
+            nonlocal shown_s
             if what not in tasks:
                 tasks[what] = shown.add_task(what, total=total)
+            elif done < total and monotonic() - shown_s < EVERY_S:  # told of every row
+                return
+            shown_s = monotonic()
             shown.update(tasks[what], completed=done, total=total)
 
         yield report

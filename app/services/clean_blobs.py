@@ -14,6 +14,7 @@ from itertools import islice
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.blobs import BlobStore, StoredBlob
+from app.errors import Conflict
 from app.jobs.queue import JobQueue
 from app.services.backup_archive import Progress
 from app.services.check_blobs import named_now
@@ -21,6 +22,7 @@ from app.services.check_blobs import named_now
 __all__ = ["Cleaned", "clean_blobs"]
 
 _AT_A_TIME = 1000
+_FEW = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +36,25 @@ class Cleaned:
 
 def clean_blobs(
     sessions: sessionmaker[Session], queue: JobQueue, blobs: BlobStore,
-    older_than: timedelta, dry_run: bool, progress: Progress,
+    older_than: timedelta, dry_run: bool, progress: Progress, even_most: bool = False,
 ) -> Cleaned:  # fmt: skip
-    """Delete what nobody names and was last put longer ago than that; it must be longer than any request takes."""
+    """Delete what nobody names and was last put longer ago than that; it must be longer than any request takes.
+
+    Raises Conflict where that is most of the store, unless `even_most`: it may be the store of another database.
+    """
     before = datetime.now(UTC) - older_than
     _, named = named_now(sessions, queue)
-    orphans = [blob for blob in blobs.stored() if blob.sha256 not in named]
+    total, orphans = 0, []
+    for blob in blobs.stored():
+        total += 1
+        if blob.sha256 not in named:
+            orphans.append(blob)
     old = [blob for blob in orphans if blob.stored_at < before]
+    if len(old) > max(_FEW, total / 2) and not (dry_run or even_most):
+        raise Conflict(
+            f"the database names none of {len(old):,} of the {total:,} blobs: is it the one that they belong to? See "
+            "ISODYN_DATABASE_URL and ISODYN_BLOB_URL; if so, give --even-most"
+        )
     count = size_bytes = done = 0
     for batch in _batches(old):
         _, named = named_now(sessions, queue)

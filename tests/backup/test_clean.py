@@ -15,6 +15,7 @@ from sqlalchemy import delete
 
 from app.blobs import BlobStore, FolderBlobStore
 from app.db.tables import Building, Calibration, Floor, Map, Organisation, Survey, new_id
+from app.errors import Conflict
 from app.services.check_blobs import check_blobs
 from app.services.clean_blobs import Cleaned, clean_blobs
 
@@ -115,6 +116,17 @@ def test_whatever_is_named_is_never_deleted(bare: Any, state: list[tuple[str | N
     assert left == needed | {sha256 for sha256, age in ages.items() if age < 1.0}
     for sha256 in left:
         bare.blobs.discard(sha256)
+
+
+def test_most_of_a_store_is_not_deleted_unasked(bare: Any) -> None:
+    """It may be the store of another database."""
+    for number in range(30):
+        make_old(bare.blobs, bare.blobs.put(b"of another database %d" % number))
+    with pytest.raises(Conflict, match="ISODYN_DATABASE_URL"):
+        clean(bare)
+    assert len(bare.blob_names()) == 30
+    assert clean(bare, dry_run=True).blobs == 30
+    assert clean_blobs(bare.sessions, bare.queue, bare.blobs, DAY, False, quiet, even_most=True).blobs == 30
 
 
 class Meddler(FolderBlobStore):
