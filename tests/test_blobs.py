@@ -8,7 +8,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -56,6 +56,26 @@ class BlobStoreContract(ABC):
         assert all(abs((datetime.now(UTC) - each.stored_at).total_seconds()) < 60 for each in listed)
         store.discard(listed[0].sha256)
         assert len(list(store.stored())) == 2
+
+    def test_putting_again_makes_a_blob_young(self, tmp_path: Path) -> None:
+        store = self.open(tmp_path)
+        sha256 = store.put(b"magnetite")
+        first = next(store.stored()).stored_at
+        time.sleep(1.1)  # stores may tell whole seconds only
+        store.put(b"magnetite")
+        assert next(store.stored()).stored_at > first
+        assert not store.discard_older(sha256, first + timedelta(seconds=0.5))
+        assert store.exists(sha256)
+
+    def test_an_old_blob_is_discarded_once(self, tmp_path: Path) -> None:
+        store = self.open(tmp_path)
+        sha256 = store.put(b"magnetite")
+        later = datetime.now(UTC) + timedelta(hours=1)
+        assert store.discard_older(sha256, later)
+        assert not store.exists(sha256)
+        assert not store.discard_older(sha256, later)
+        with pytest.raises(NotFound):
+            store.discard_older("../lock", later)
 
     def test_blobs_outlive_the_store_object(self, tmp_path: Path) -> None:
         sha256 = self.open(tmp_path).put(b"magnetite")
@@ -107,11 +127,26 @@ class TestFolderBlobStore(BlobStoreContract):
     def damage(self, place: Path, sha256: str) -> None:
         (place / "blobs" / sha256[:2] / sha256[2:4] / sha256).write_bytes(b"magnetit")
 
+    def test_discarding_by_age_never_takes_what_a_put_acknowledges(self, tmp_path: Path) -> None:
+        """Every put finds an old blob that somebody discards at that moment; what it acknowledges is there."""
+        store, data = FolderBlobStore(tmp_path / "blobs"), b"magnetite"
+        sha256 = store.put(data)
+        file = tmp_path / "blobs" / sha256[:2] / sha256[2:4] / sha256
+        for _ in range(300):
+            os.utime(file, (0, 0))
+            with ThreadPoolExecutor(2) as pool:
+                discarding = [pool.submit(store.discard_older, sha256, datetime(2000, 1, 1, tzinfo=UTC))]
+                putting = pool.submit(store.put, data)
+            discarding[0].result()
+            assert putting.result() == sha256
+            assert store.get(sha256) == data
+
     def test_nothing_but_blobs_is_left(self, tmp_path: Path) -> None:
         self.open(tmp_path).put(b"magnetite")
-        assert [file.name for file in tmp_path.rglob("*") if file.is_file()] == [
-            hashlib.sha256(b"magnetite").hexdigest()
-        ]
+        assert {file.name for file in tmp_path.rglob("*") if file.is_file()} == {
+            hashlib.sha256(b"magnetite").hexdigest(),
+            "lock",
+        }
 
     def test_killed_in_the_middle_of_a_put_nothing_is_visible(self, tmp_path: Path) -> None:
         """Killed again and again at other moments: every blob to be seen is whole."""
@@ -151,7 +186,7 @@ class TestFolderBlobStore(BlobStoreContract):
             [sys.executable, "-c", code, str(tmp_path)], env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False
         )
         assert run.returncode == 7
-        assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
+        assert [file for file in tmp_path.rglob("*") if file.is_file() and file.name != "lock"] == []
 
 
 def test_addresses(tmp_path: Path) -> None:

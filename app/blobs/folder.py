@@ -1,16 +1,19 @@
 """Blobs in a local folder. Putting the same bytes again, also from several processes at once, is the same as once.
 
-A blob is written under a temporary name in the same file system, forced to the disk, and renamed.
+A blob is written under a temporary name in the same file system, forced to the disk, and renamed. The time of its file
+says when it was last put. A lock, `tmp/lock`, held for moments only, keeps putting and discarding by age apart.
 """
 
+import fcntl
 import hashlib
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.blobs.store import StoredBlob, check_name
+from app.blobs.store import StoredBlob, check_name, is_name
 from app.errors import CorruptArtefact, NotFound
 
 __all__ = ["FolderBlobStore"]
@@ -27,7 +30,7 @@ class FolderBlobStore:
     def put(self, data: bytes) -> str:
         sha256 = hashlib.sha256(data).hexdigest()
         target = self._path(sha256)
-        if not self._holds(target, sha256):
+        if not (self._holds(target, sha256) and self._refresh(target)):
             self._write(target, data)
         # Also when another process has just renamed it: what this call acknowledges must outlive a power cut. A new
         # folder is on the disk once the folder that names it is.
@@ -56,8 +59,22 @@ class FolderBlobStore:
         check_name(sha256)
         self._path(sha256).unlink(missing_ok=True)
 
+    def discard_older(self, sha256: str, before: datetime) -> bool:
+        check_name(sha256)
+        path = self._path(sha256)
+        with self._locked(fcntl.LOCK_EX):
+            try:
+                if datetime.fromtimestamp(path.stat().st_mtime, UTC) >= before:
+                    return False
+                path.unlink()
+            except FileNotFoundError:
+                return False
+        return True
+
     def stored(self) -> Iterator[StoredBlob]:
         for path in sorted(self._folder.glob("[0-9a-f][0-9a-f]/[0-9a-f][0-9a-f]/*")):
+            if not is_name(path.name):  # somebody else's file
+                continue
             try:
                 told = path.stat()
             except FileNotFoundError:  # discarded meanwhile
@@ -75,6 +92,28 @@ class FolderBlobStore:
         except FileNotFoundError:
             return False
 
+    def _refresh(self, path: Path) -> bool:
+        """Set the file's time to now; False when it was discarded meanwhile."""
+        with self._locked(fcntl.LOCK_SH):
+            try:
+                os.utime(path)
+            except FileNotFoundError:
+                return False
+        return True
+
+    @contextmanager
+    def _locked(self, kind: int) -> Iterator[None]:
+        descriptor = os.open(self._temporary / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            try:
+                fcntl.flock(descriptor, kind)
+            except OSError:  # a file system without locks: there nobody can discard by age, and putting needs none
+                if kind == fcntl.LOCK_EX:
+                    raise
+            yield
+        finally:
+            os.close(descriptor)
+
     def _write(self, target: Path, data: bytes) -> None:
         descriptor, name = tempfile.mkstemp(dir=self._temporary)
         temporary = Path(name)
@@ -84,7 +123,8 @@ class FolderBlobStore:
                 file.flush()
                 os.fsync(file.fileno())
             target.parent.mkdir(parents=True, exist_ok=True)
-            temporary.replace(target)
+            with self._locked(fcntl.LOCK_SH):
+                temporary.replace(target)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from app.errors import NotFound
 
-__all__ = ["BlobStore", "StoredBlob", "check_name"]
+__all__ = ["BlobStore", "StoredBlob", "check_name", "is_name"]
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -24,7 +24,10 @@ class BlobStore(Protocol):
     """What every store keeps to; `BlobStoreContract` in the tests says it in full."""
 
     def put(self, data: bytes) -> str:
-        """Store bytes durably and return their SHA-256, 64 lower-case hexadecimal digits."""
+        """Store bytes durably and return their SHA-256, 64 lower-case hexadecimal digits.
+
+        Also where they are there already, `stored_at` is now: what was put of late may be about to be named.
+        """
         ...
 
     def get(self, sha256: str) -> bytes:
@@ -39,6 +42,14 @@ class BlobStore(Protocol):
         """Forget a blob that nothing refers to any more; none there is as good."""
         ...
 
+    def discard_older(self, sha256: str, before: datetime) -> bool:
+        """Forget a blob last put before this time, and say whether it was forgotten by this call.
+
+        Against a `put` of the same bytes at the same moment: either this sees the new time and keeps the blob, or that
+        finds no blob and writes it.
+        """
+        ...
+
     def stored(self) -> Iterator[StoredBlob]:
         """Every blob there is, in order of hash; those that come or go meanwhile may be among them or not."""
         ...
@@ -47,5 +58,10 @@ class BlobStore(Protocol):
 def check_name(sha256: str) -> None:
     """Raises NotFound for what is no SHA-256 in hexadecimal digits."""
     # Also what keeps `../` out of paths.
-    if not _SHA256.fullmatch(sha256):
+    if not is_name(sha256):
         raise NotFound(f"{sha256[:80]!r} is not the SHA-256 of a blob: 64 lower-case hexadecimal digits are expected")
+
+
+def is_name(name: str) -> bool:
+    """Whether this is a SHA-256 as the stores write it."""
+    return _SHA256.fullmatch(name) is not None

@@ -2,7 +2,7 @@
 
 import typer
 
-from app.cli import calibrate, client, demo, doctor, evaluate, evaluate_tracks, keys, serve, view
+from app.cli import backup, calibrate, client, demo, doctor, evaluate, evaluate_tracks, keys, serve, view
 from app.cli.default_group import DEFAULT, DefaultGroup
 
 __all__ = ["main"]
@@ -30,4 +30,7 @@ evaluations.command("tracks")(evaluate_tracks.tracks)
 main.add_typer(evaluations, name="evaluate")
 main.add_typer(keys.commands, name="keys")
 main.command()(doctor.doctor)
+main.command()(backup.backup)
+main.command()(backup.restore)
+main.command()(backup.clean)
 main.command()(serve.openapi)

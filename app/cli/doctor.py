@@ -5,36 +5,34 @@ import shutil
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from app.cli.environment import read_settings
+from app.cli.finding import Finding
 from app.errors import InvalidInput, Unavailable
 from app.settings import Settings
 
-__all__ = ["Finding", "doctor", "examine"]
+__all__ = ["doctor", "examine"]
 
 LOW_DISK_BYTES = 2**30
 FRESH_BEAT_S = 120
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing looked at: `ok` True, False (broken) or None (works, could be better), and what to do."""
-
-    what: str
-    ok: bool | None
-    seen: str
-    advice: str = ""
-
-
-def doctor() -> None:
+def doctor(
+    deep: Annotated[bool, typer.Option("--deep", help="also read every blob, which may take long")] = False,
+) -> None:
     """Look at Python, disk, database, blobs, worker and port; say what is wrong and what to do."""
-    findings = examine(read_settings())
+    settings = read_settings()
+    findings = examine(settings)
+    if deep:
+        from app.cli.deep_look import examine_blobs
+
+        findings += examine_blobs(settings)
     table = Table("", "what", "seen", "what to do", show_lines=False)
     marks = {True: "[green]ok[/green]", None: "[yellow]note[/yellow]", False: "[red]wrong[/red]"}
     for finding in findings:

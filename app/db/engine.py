@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.engine import URL
@@ -19,7 +19,22 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from app.errors import InvalidInput
 
-__all__ = ["create_database_engine", "downgrade", "migrate", "migration_state", "session_factory", "teach_old_sqlite"]
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+__all__ = [
+    "alembic_config",
+    "begin_writing",
+    "create_database_engine",
+    "downgrade",
+    "migrate",
+    "migrate_job_engine",
+    "migration_lock",
+    "migration_state",
+    "prepare_sqlite_file",
+    "session_factory",
+    "teach_old_sqlite",
+]
 
 BUSY_TIMEOUT_S = 30.0
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
@@ -52,29 +67,43 @@ def migrate(database: Engine | str) -> None:
     Several processes may call this at once: one migrates, the others wait and find it done.
     """
     with _engine_of(database) as engine:
-        _prepare_sqlite_file(engine)
-        with _migration_lock(engine):
+        prepare_sqlite_file(engine)
+        with migration_lock(engine):
             _run_alembic(engine, "upgrade", "head")
-            _migrate_job_engine(engine.url)
+            migrate_job_engine(engine.url)
 
 
 def downgrade(database: Engine | str, revision: str = "base") -> None:
     """Take our schema back to `revision`; the job engine's own tables stay."""
-    with _engine_of(database) as engine, _migration_lock(engine):
+    with _engine_of(database) as engine, migration_lock(engine):
         _run_alembic(engine, "downgrade", revision)
 
 
 def migration_state(engine: Engine) -> tuple[str | None, str | None]:
     """The revision our schema is at, and the newest one this version knows."""
-    from alembic.config import Config
     from alembic.runtime.migration import MigrationContext
     from alembic.script import ScriptDirectory
 
-    config = Config()
-    config.set_main_option("script_location", str(resources.files("migrations")).replace("%", "%%"))
     with engine.connect() as connection:
         at = MigrationContext.configure(connection).get_current_revision()
-    return at, ScriptDirectory.from_config(config).get_current_head()
+    return at, ScriptDirectory.from_config(alembic_config()).get_current_head()
+
+
+def alembic_config() -> "Config":
+    """Where Alembic finds the migrations, wherever this is installed."""
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(resources.files("migrations")).replace("%", "%%"))
+    return config
+
+
+def begin_writing(connection: Connection) -> None:
+    """Begin a transaction that may change the schema, too."""
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+    else:
+        connection.begin()
 
 
 def _checked(url: str) -> URL:
@@ -142,7 +171,7 @@ def _begin_before_savepoint(connection: Connection, _name: str) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
-def _prepare_sqlite_file(engine: Engine) -> None:
+def prepare_sqlite_file(engine: Engine) -> None:
     """Make the folder, and set write-ahead logging once: it persists in the file."""
     if engine.dialect.name != "sqlite":
         return
@@ -160,7 +189,7 @@ def _prepare_sqlite_file(engine: Engine) -> None:
 
 
 @contextmanager
-def _migration_lock(engine: Engine) -> Iterator[None]:
+def migration_lock(engine: Engine) -> Iterator[None]:
     """PostgreSQL: one migration at a time. SQLite: the write transaction of each step is lock enough."""
     if engine.dialect.name == "sqlite":
         yield
@@ -178,22 +207,18 @@ def _migration_lock(engine: Engine) -> Iterator[None]:
 
 def _run_alembic(engine: Engine, verb: str, revision: str) -> None:
     from alembic import command
-    from alembic.config import Config
 
-    config = Config()
-    config.set_main_option("script_location", str(resources.files("migrations")).replace("%", "%%"))
+    config = alembic_config()
     run: Any = getattr(command, verb)
     with engine.connect() as connection:
-        if engine.dialect.name == "sqlite":
-            connection.exec_driver_sql("BEGIN IMMEDIATE")
-        else:
-            connection.begin()
+        begin_writing(connection)
         config.attributes["connection"] = connection
         run(config, revision)
         connection.commit()
 
 
-def _migrate_job_engine(url: URL) -> None:
+def migrate_job_engine(url: URL) -> None:
+    """Make the job engine's tables, or bring them to its version; under the `migration_lock`."""
     from dbos import DBOS
 
     teach_old_sqlite()

@@ -4,6 +4,7 @@ Every change to the jobs of a floor locks the floor's row first, so it is serial
 always taken in the order floor, job, anything else.
 """
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 
 from dbos import EnqueueOptions
@@ -81,6 +82,30 @@ class JobQueue:
                 claim_generation(session, job.floor_id, generation)
         session.flush()
         return job
+
+    def enqueue_again(self, session: Session, job: Job) -> None:
+        """Let a job that had not ended begin anew under its old name, where the engine knows nothing of it.
+
+        For a database that was restored: the engine's own tables are not restored with ours.
+        """
+        job.status, job.progress, job.started_at = "accepted", 0, None
+        job.message = "waiting for a worker, anew: the installation was restored from a backup"
+        begun = update(Map).where(Map.id == job.map_id, Map.status == "running")
+        session.execute(begun.values(status="accepted"))
+        if job.kind == REBUILD:
+            self._enqueue(session, job, job.floor_id, int(job.workflow_id.rsplit(":", 1)[1]))
+        else:
+            self._enqueue(session, job, str(job.map_id))
+
+    def recorded(self, session: Session) -> Iterator[object]:
+        """What the engine has recorded of the steps of every job that has not ended: plans and results."""
+        for workflow_id in session.scalars(select(Job.workflow_id).where(Job.status.not_in(FINAL_STATES))).all():
+            for step in self._client.list_workflow_steps(workflow_id):
+                yield step["output"]
+
+    def knows_jobs(self) -> bool:
+        """Whether the engine has a record of any job, ended or not."""
+        return bool(self._client.list_workflows(limit=1, load_input=False, load_output=False))
 
     def close(self) -> None:
         self._client.destroy()

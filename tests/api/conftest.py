@@ -76,7 +76,7 @@ class Service:
             return {t.name: len(session.execute(select(t)).all()) for t in Base.metadata.sorted_tables}
 
     def blob_count(self) -> int:
-        return sum(path.is_file() for path in (self.context.settings.data_dir / "blobs").rglob("*"))
+        return sum(1 for _ in self.context.blobs.stored())
 
 
 class Logged:

@@ -8,13 +8,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from sqlalchemy import update
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
+from app.blobs import open_blob_store
 from app.cli import main
 from app.cli.doctor import examine
 from app.db.engine import create_database_engine
-from app.db.tables import Key, utc_now
+from app.db.tables import Calibration, Key, Organisation, utc_now
 from app.errors import InvalidInput
 from app.main import first_start
 from app.settings import Settings
@@ -46,6 +48,9 @@ def test_every_command_explains_itself() -> None:
         "keys",
         "doctor",
         "openapi",
+        "backup",
+        "restore",
+        "clean",
     )
     for command in commands:
         result = runner.invoke(main, [command, "--help"])
@@ -95,6 +100,59 @@ def test_the_doctor_notices_an_unreachable_database(data_dir: Path, monkeypatch:
     monkeypatch.setenv("ISODYN_DATABASE_URL", "postgresql+psycopg://nobody@127.0.0.1:1/none?connect_timeout=2")
     findings = {finding.what: finding for finding in examine(Settings())}
     assert findings["database"].ok is False
+
+
+def test_a_backup_is_made_restored_looked_at_and_cleaned(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert runner.invoke(main, ["backup", str(tmp_path)]).exit_code == 2, "there is nothing"
+    first_start(Settings())
+    made = runner.invoke(main, ["backup", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    (archive,) = tmp_path.glob("isodyn-*.zip")
+    keys = runner.invoke(main, ["keys", "list"]).output
+    refused = runner.invoke(main, ["restore", str(archive)])
+    assert refused.exit_code == 2
+    assert "not empty" in refused.output
+    monkeypatch.setenv("ISODYN_DATA_DIR", str(tmp_path / "new"))
+    done = runner.invoke(main, ["restore", str(archive)])
+    assert done.exit_code == 0, done.output
+    assert runner.invoke(main, ["keys", "list"]).output == keys
+    blobs = open_blob_store(Settings().resolved_blob_url)
+    sha256 = blobs.put(b"orphan")
+    file = tmp_path / "new" / "blobs" / sha256[:2] / sha256[2:4] / sha256
+    assert "0 blobs deleted" in runner.invoke(main, ["clean"]).output
+    os.utime(file, (0, 0))
+    looked = runner.invoke(main, ["doctor", "--deep"])
+    assert looked.exit_code == 0, looked.output
+    assert "isodyn clean" in looked.output
+    assert "1 blobs would be deleted, 6 bytes" in runner.invoke(main, ["clean", "--dry-run"]).output
+    assert "1 blobs deleted, 6 bytes" in runner.invoke(main, ["clean", "--older-than", "2d"]).output
+    assert not file.exists()
+    for wrong in ("5m", "a day", "-1h"):
+        assert runner.invoke(main, ["clean", "--older-than", wrong]).exit_code == 2
+
+
+def test_a_deep_look_finds_damaged_and_missing_blobs(data_dir: Path) -> None:
+    first_start(Settings())
+    blobs = open_blob_store(Settings().resolved_blob_url)
+    damaged, missing = blobs.put(b"damaged"), "0" * 64
+    engine = create_database_engine(Settings().resolved_database_url)
+    with Session(engine) as session, session.begin():
+        owner = session.scalars(select(Organisation.id)).one()
+        for version, sha256 in enumerate((damaged, missing)):
+            session.add(Calibration(
+                organisation_id=owner, device="d", version=version, method="m", model={}, fit={}, reference={},
+                samples_sha256=sha256, measured_at=utc_now(),
+            ))  # fmt: skip
+    engine.dispose()
+    (data_dir / "blobs" / damaged[:2] / damaged[2:4] / damaged).write_bytes(b"Damaged")
+    result = runner.invoke(main, ["doctor", "--deep"])
+    assert result.exit_code == 1
+    assert "damaged blobs" in result.output
+    assert "missing blobs" in result.output
+    assert "calibration.samples_sha256" in result.output.replace("\n", "")
+    assert runner.invoke(main, ["doctor"]).exit_code == 0
 
 
 def test_openapi_is_written(data_dir: Path, tmp_path: Path) -> None:
