@@ -15,38 +15,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import app.tracking.track as tracking
-from app.field.error_structure import ErrorStructure
 from app.field.grid import FieldGrid
 from app.positioning.floors import prepare_floor
+from app.synthetic.hall import HALL_CORNERS_M, hall_map, hall_uT
 from app.tracking.options import TrackOptions
 from app.tracking.step import Step
 from app.tracking.track import begin, follow, make_tracker
 
-CORNERS_M = np.array([[1.0, 1.0], [10.5, 6.5], [10.5, 2.0], [2.0, 5.5], [9.0, 1.0], [2.0, 2.0], [10.0, 7.0]])
 SIZES_UT = (0.0, 5.0, 10.0, 20.0, 40.0)
 WITHIN = 0.2
-
-
-def hall_uT(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.stack(
-        [
-            18 + 6 * np.sin(0.9 * x + 0.3) * np.cos(0.7 * y),
-            3 + 5 * np.cos(0.6 * x - 0.8 * y),
-            -42 + 6 * np.sin(0.5 * x + 1.1 * y),
-        ],
-        axis=-1,
-    )
-
-
-def hall() -> FieldGrid:
-    x, y = np.meshgrid(np.arange(-3.0, 15.01, 0.25), np.arange(-3.0, 11.01, 0.25))
-    mean = hall_uT(x, y)[None]
-    gradient = np.stack([np.gradient(mean, 0.25, axis=2), np.gradient(mean, 0.25, axis=1)], axis=-1)
-    return FieldGrid(
-        "vector", (-3.0, -3.0), 0.25, np.array([1.2]), mean.astype(np.float32), np.full(mean.shape, 0.3, np.float32),
-        gradient.astype(np.float32), np.ones(mean.shape[:3], dtype=np.bool_), np.array([18.0, 3.0, -42.0]),
-        np.full(3, 5.0), np.full(3, 0.4), 0.0, ErrorStructure(0.0, 0.0, 1.0, 1.0),
-    )  # fmt: skip
 
 
 def walk(grid: FieldGrid, size_uT: float, seed: int) -> tuple[float, float, float]:
@@ -54,8 +31,8 @@ def walk(grid: FieldGrid, size_uT: float, seed: int) -> tuple[float, float, floa
     n = 480
     tracker = make_tracker([prepare_floor("hall", grid)], "level", TrackOptions(particles=2000, noise_uT=0.3), 7)
     t = 0.1 * np.arange(n)
-    legs = np.linalg.norm(np.diff(CORNERS_M, axis=0), axis=1)
-    p = np.stack([np.interp(t, np.r_[0, np.cumsum(legs)], CORNERS_M[:, k]) for k in (0, 1)], axis=1)
+    legs = np.linalg.norm(np.diff(HALL_CORNERS_M, axis=0), axis=1)
+    p = np.stack([np.interp(t, np.r_[0, np.cumsum(legs)], HALL_CORNERS_M[:, k]) for k in (0, 1)], axis=1)
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=3)
     passing = np.exp(-0.5 * ((t - 25.0) / 1.25) ** 2)[:, None] * size_uT * direction / np.linalg.norm(direction)
@@ -76,7 +53,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--walks", type=int, default=8)
     asked = parser.parse_args()
-    grid, fits = hall(), tracking.is_disturbed
+    grid, fits = hall_map(), tracking.is_disturbed
     print(f"{'size':>8} {'believed':>10} {'tested':>10} {'ratio':>7} {'disturbed during, else':>24}")
     good = True
     for size in SIZES_UT:

@@ -22,9 +22,9 @@ from threadpoolctl import threadpool_limits
 from app.blobs import BlobStore, FolderBlobStore
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.db.tables import Building, Floor, Map, Organisation
-from app.field.error_structure import ErrorStructure
 from app.field.grid import FieldGrid
 from app.services.artefacts import grid_to_bytes
+from app.synthetic.hall import HALL_CORNERS_M, hall_map, hall_uT
 from tests.s3_server import ENVIRONMENT, Server, started
 
 if TYPE_CHECKING:
@@ -45,32 +45,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=f"no browser at {CHROMIUM}: apt-get install chromium"))
 
 
-HALL_CORNERS_M = np.array([[1.0, 1.0], [10.5, 6.5], [10.5, 2.0], [2.0, 5.5], [9.0, 1.0], [2.0, 2.0], [10.0, 7.0]])
-
-
-def hall_uT(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The field of a hall of 12 m by 8 m, known everywhere: (n, 3)."""
-    return np.stack(
-        [
-            18 + 6 * np.sin(0.9 * x + 0.3) * np.cos(0.7 * y),
-            3 + 5 * np.cos(0.6 * x - 0.8 * y),
-            -42 + 6 * np.sin(0.5 * x + 1.1 * y),
-        ],
-        axis=-1,
-    )
-
-
 @pytest.fixture(scope="session")
 def hall_grid() -> FieldGrid:
     """Its map, as good as a map can be, and 3 m more on every side."""
-    x, y = np.meshgrid(np.arange(-3.0, 15.01, 0.25), np.arange(-3.0, 11.01, 0.25))
-    mean = hall_uT(x, y)[None]
-    gradient = np.stack([np.gradient(mean, 0.25, axis=2), np.gradient(mean, 0.25, axis=1)], axis=-1)
-    return FieldGrid(
-        "vector", (-3.0, -3.0), 0.25, np.array([1.2]), mean.astype(np.float32), np.full(mean.shape, 0.3, np.float32),
-        gradient.astype(np.float32), np.ones(mean.shape[:3], dtype=np.bool_), np.array([18.0, 3.0, -42.0]),
-        np.full(3, 5.0), np.full(3, 0.4), 0.0, ErrorStructure(0.0, 0.0, 1.0, 1.0),
-    )  # fmt: skip
+    return hall_map()
 
 
 @pytest.fixture(scope="session")

@@ -19,22 +19,11 @@ from app.main import create_app, first_start
 from app.services.build_map import claim_build, fit_build, publish_build
 from app.services.manage_keys import create_key
 from app.settings import Settings
+from app.synthetic.hall import hall_uT
 
 ADMIN = "isd_admin-of-the-first-organisation"
 STRANGER = "isd_admin-of-another-organisation"
 HEADER = "t_s,x_m,y_m,z_m,bx_ut,by_ut,bz_ut"
-
-
-def field_uT(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A smooth field that differs from place to place: (n, 3)."""
-    return np.stack(
-        [
-            18 + 6 * np.sin(0.9 * x + 0.3) * np.cos(0.7 * y),
-            3 + 5 * np.cos(0.6 * x - 0.8 * y),
-            -42 + 6 * np.sin(0.5 * x + 1.1 * y),
-        ],
-        axis=1,
-    )
 
 
 def make_walk_csv(seed: int, width_m: float = 12.0, depth_m: float = 8.0, offset_m: float = 0.0) -> bytes:
@@ -44,7 +33,7 @@ def make_walk_csv(seed: int, width_m: float = 12.0, depth_m: float = 8.0, offset
     lanes = np.arange(offset_m, depth_m, 0.8)
     x = np.concatenate([xs if k % 2 == 0 else xs[::-1] for k in range(len(lanes))])
     y = np.repeat(lanes, len(xs))
-    B = field_uT(x, y) + rng.normal(0, 0.3, (len(x), 3))
+    B = hall_uT(x, y) + rng.normal(0, 0.3, (len(x), 3))
     t = 0.2 * np.arange(len(x))
     rows = np.column_stack([t, x, y, np.full(len(x), 1.2), B])
     return (HEADER + "\n" + "\n".join(",".join(f"{v:.4f}" for v in row) for row in rows) + "\n").encode()
@@ -116,7 +105,7 @@ def walk_csv() -> Callable[..., bytes]:
 
 @pytest.fixture(scope="session")
 def true_field_uT() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    return field_uT
+    return hall_uT
 
 
 @pytest.fixture(scope="session")

@@ -9,39 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from app.errors import InvalidInput
 from app.field.error_structure import ErrorStructure
-from app.field.grid import FieldGrid
 from app.positioning.explanation import ExplainedPlace
 from app.positioning.floors import prepare_floor
 from app.positioning.window import Window
 from app.services.calibrate_on_map import calibrate_on_map, offset_by_turns, way_of
+from app.synthetic.hall import HALL_CORNERS_M, hall_map, hall_uT
 
 HARD_IRON_UT = np.array([21.0, -18.0, 11.0])
 DISTORTION = np.array([[1.06, 0.02, -0.01], [0.02, 0.95, 0.03], [-0.01, 0.03, 1.02]])
-CORNERS_M = np.array([[1.0, 1.0], [10.5, 6.5], [10.5, 2.0], [2.0, 5.5], [9.0, 1.0], [2.0, 2.0], [10.0, 7.0]])
-
-
-def hall_uT(x, y):
-    """(..., 3) of a hall of 12 m by 8 m."""
-    return np.stack(
-        [
-            18 + 6 * np.sin(0.9 * x + 0.3) * np.cos(0.7 * y),
-            3 + 5 * np.cos(0.6 * x - 0.8 * y),
-            -42 + 6 * np.sin(0.5 * x + 1.1 * y),
-        ],
-        axis=-1,
-    )
 
 
 @pytest.fixture(scope="module")
 def floor():
-    x, y = np.meshgrid(np.arange(0.0, 12.01, 0.25), np.arange(0.0, 8.01, 0.25))
-    mean = hall_uT(x, y)[None]
-    gradient = np.stack([np.gradient(mean, 0.25, axis=2), np.gradient(mean, 0.25, axis=1)], axis=-1)
-    grid = FieldGrid(
-        "vector", (0.0, 0.0), 0.25, np.array([1.2]), mean.astype(np.float32), np.full(mean.shape, 0.3, np.float32),
-        gradient.astype(np.float32), np.ones(mean.shape[:3], dtype=np.bool_), np.array([18.0, 3.0, -42.0]),
-        np.full(3, 5.0), np.full(3, 0.4), 1.0, ErrorStructure(0.1, 0.3, 0.6, 1.0),
-    )  # fmt: skip
+    grid = hall_map(0.0, ErrorStructure(0.1, 0.3, 0.6, 1.0), 1.0)
     return prepare_floor("hall", grid)
 
 
@@ -49,9 +29,9 @@ def floor():
 def walk():
     """(places (n, 2), headings (n,), rotations, readings in the phone's axes), 0.2 m apart."""
     rng = np.random.default_rng(5)
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(CORNERS_M, axis=0), axis=1))])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(HALL_CORNERS_M, axis=0), axis=1))])
     s = np.arange(0.0, length[-1], 0.2)
-    p = np.stack([np.interp(s, length, CORNERS_M[:, k]) for k in (0, 1)], axis=1)
+    p = np.stack([np.interp(s, length, HALL_CORNERS_M[:, k]) for k in (0, 1)], axis=1)
     p = gaussian_filter1d(p, 2.0, axis=0, mode="nearest")
     heading = np.unwrap(np.arctan2(*np.gradient(p, axis=0).T[::-1]))
     R = Rotation.from_euler("Z", heading[:, None]).as_matrix()

@@ -5,12 +5,12 @@ import pytest
 
 from app.field.grid import FieldGrid
 from app.positioning.floors import prepare_floor
+from app.synthetic.hall import HALL_CORNERS_M, hall_uT
 from app.tracking.disturbance import is_disturbed
 from app.tracking.options import TrackOptions
 from app.tracking.step import Step
 from app.tracking.stored_state import state_from_bytes, state_to_bytes
 from app.tracking.track import begin, follow, make_tracker
-from tests.conftest import HALL_CORNERS_M, hall_uT
 
 STEPS, FROM_S, TO_S = 480, 22.0, 28.0
 
