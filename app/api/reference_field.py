@@ -8,17 +8,16 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
-from app.api.auth import Identity, Measuring
-from app.api.context import Context, ContextDep
+from app.api.auth import Measuring
+from app.api.context import ContextDep
 from app.api.models import Finite
-from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
-from app.db.tables import Building
 from app.earth_field import EarthField, earth_field, field_in_building_uT
 from app.errors import Fault, InvalidInput
 from app.geodesy import Anchor
+from app.services.earth_reference import earth_at_building
 
-__all__ = ["ReferenceFieldView", "anchor_of", "router", "show_reference_field"]
+__all__ = ["ReferenceFieldView", "router", "show_reference_field"]
 
 router = APIRouter(prefix="/v1", tags=["calibration"], responses=ERROR_RESPONSES)
 
@@ -75,24 +74,14 @@ def get_reference_field(
         if latitude_deg is not None or longitude_deg is not None:
             reason = "give a building_id or a latitude and longitude, not both"
             raise InvalidInput(reason, Fault("/query/building_id", reason))
-        anchor = anchor_of(context, identity, building_id)
-        field = earth_field(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m, on)
+        with context.transaction() as session:
+            field, anchor = earth_at_building(session, identity.organisation_id, building_id, on, "/query/building_id")
         return show_reference_field(field, anchor, in_building=True)
     if latitude_deg is None or longitude_deg is None:
         reason = "say where: latitude_deg and longitude_deg, or building_id"
         raise InvalidInput(reason, Fault("/query/latitude_deg", reason))
     anchor = Anchor(latitude_deg, longitude_deg, height_m, 0.0)
     return show_reference_field(earth_field(latitude_deg, longitude_deg, height_m, on), anchor, in_building=False)
-
-
-def anchor_of(context: Context, identity: Identity, building_id: str) -> Anchor:
-    """Raises NotFound, and InvalidInput for a building that has none."""
-    with context.transaction() as session:
-        told = find_own(session, identity, Building, building_id).anchor
-    if told is None:
-        reason = f"building {building_id} has no anchor: PATCH its latitude, longitude, height and bearing first"
-        raise InvalidInput(reason, Fault("building_id", reason))
-    return Anchor(**told)
 
 
 def show_reference_field(field: EarthField, anchor: Anchor, *, in_building: bool) -> ReferenceFieldView:

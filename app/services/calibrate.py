@@ -17,13 +17,13 @@ from app.calibration.modified_ellipsoid import modified_ellipsoid
 from app.calibration.strict_ellipse import strict_ellipse
 from app.calibration.swinging import swinging
 from app.calibration.two_step import two_step
-from app.db.tables import Building
 from app.earth_field import EarthField, earth_field
-from app.errors import Conflict, Fault, InvalidInput, NotFound
+from app.errors import Conflict, Fault, InvalidInput
 from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.positioning.window import Window
 from app.services.calibrate_on_map import calibrate_on_map
+from app.services.earth_reference import earth_at_building, told_model
 from app.services.estimate_attitude import check_vector
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
@@ -101,7 +101,7 @@ def _by_turning(
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
     earth = None if asked.place is None else _earth(sessions, organisation_id, asked.place)
     readings = {"b_ut": asked.B_uT}
-    told: dict[str, Any] = {} if earth is None else {"model": earth.model, "date": earth.on.isoformat()}
+    told: dict[str, Any] = {} if earth is None else told_model(earth)
     if asked.method in CIRCLE_METHODS:
         horizontal, vertical = asked.horizontal_uT, asked.vertical_uT
         if earth is not None:
@@ -126,14 +126,10 @@ def _earth(sessions: sessionmaker[Session], organisation_id: str, place: Place) 
         assert place.longitude_deg is not None
         return earth_field(place.latitude_deg, place.longitude_deg, place.height_m, place.on)
     with sessions() as session:
-        building = session.get(Building, place.building_id)
-    if building is None or building.organisation_id != organisation_id:
-        raise NotFound(f"no building {place.building_id}")
-    if building.anchor is None:
-        reason = f"building {building.id} has no anchor: PATCH its latitude, longitude, height and bearing first"
-        raise InvalidInput(reason, Fault("/body/reference/building_id", reason))
-    anchor = building.anchor
-    return earth_field(anchor["latitude_deg"], anchor["longitude_deg"], anchor["height_m"], place.on)
+        field, _ = earth_at_building(
+            session, organisation_id, place.building_id, place.on, "/body/reference/building_id"
+        )  # fmt: skip
+    return field
 
 
 def _on_a_map(

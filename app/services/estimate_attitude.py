@@ -16,12 +16,12 @@ from app.attitude.reference import (
     level_reference,
     map_reference,
 )
-from app.db.tables import Building, Floor
-from app.earth_field import earth_field, field_in_building_uT
+from app.db.tables import Floor
+from app.earth_field import field_in_building_uT
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
 from app.field.grid import FieldGrid, FieldValues
-from app.geodesy import Anchor
 from app.geometry import Array
+from app.services.earth_reference import earth_at_building, told_model
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
 
@@ -78,16 +78,11 @@ def _earth(session: Session, organisation_id: str, asked: AskedReference) -> tup
         if floor is None or floor.organisation_id != organisation_id:
             raise NotFound(f"no floor {asked.floor_id}")
         building_id = floor.building_id
-    building = session.get(Building, building_id)
-    if building is None or building.organisation_id != organisation_id:
-        raise NotFound(f"no building {building_id}")
-    if building.anchor is None:
-        reason = f"building {building_id} has no anchor: PATCH its latitude, longitude, height and bearing first"
-        raise InvalidInput(reason, Fault("/body/reference/building_id", reason))
-    anchor = Anchor(**building.anchor)
-    field = earth_field(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m, asked.on)
+    field, anchor = earth_at_building(
+        session, organisation_id, building_id, asked.on, "/body/reference/building_id"
+    )  # fmt: skip
     B_uT = field_in_building_uT(field, anchor)
-    return constant_reference(B_uT, STEEL_UT), {"model": field.model, "b_ut": B_uT.tolist(), "sd_ut": STEEL_UT}
+    return constant_reference(B_uT, STEEL_UT), told_model(field) | {"b_ut": B_uT.tolist(), "sd_ut": STEEL_UT}
 
 
 def _of_map(

@@ -48,7 +48,8 @@ def test_a_calibration_tells_everything_of_itself(service: Any) -> None:
         (np.array(turned(seed=1)) - made["model"]["hard_iron_ut"]) @ np.array(made["model"]["correction"]).T, axis=1
     )
     assert np.std(norm - FIELD_UT) < 0.07
-    assert made["reference"] == {"model": "WMM-2020", "date": "2022-09-01", "magnitude_ut": pytest.approx(53.13507)}
+    told = {"model": "WMM-2020", "date": "2022-09-01", "valid": True, "magnitude_ut": pytest.approx(53.13507)}
+    assert made["reference"] == told
     assert made["coverage"]["cells_seen"] == made["coverage"]["cells"]
     assert set(made["parameter_sd"]) <= set(made["parameters"])
     assert np.array(made["covariance"]).shape == (len(made["parameters"]),) * 2
