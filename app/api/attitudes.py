@@ -169,13 +169,13 @@ def _estimate(context: Context, identity: Identity, body: AttitudeQuery) -> Atti
     at = None if asked.position_m is None else np.atleast_2d(np.asarray(asked.position_m, dtype=np.float64))
     with context.transaction() as session:
         calibration = find_calibration(session, identity.organisation_id, body.calibration_id, body.device)
-        reference, told = find_reference(
-            session, context.grids, identity.organisation_id,
-            AskedReference(
-                asked.kind, asked.building_id, asked.floor_id, at, asked.position_sd_m, asked.horizontal_ut,
-                asked.vertical_ut, asked.date or datetime.now(UTC).date(),
-            ),
-        )  # fmt: skip
+    reference, told = find_reference(
+        context.sessions, context.grids, identity.organisation_id,
+        AskedReference(
+            asked.kind, asked.building_id, asked.floor_id, at, asked.position_sd_m, asked.horizontal_ut,
+            asked.vertical_ut, asked.date or datetime.now(UTC).date(),
+        ),
+    )  # fmt: skip
     B_uT = _rows(body.magnetometer_ut or [None] * len(body.t_s))
     if calibration is not None:
         B_uT = calibration.model.apply(B_uT)

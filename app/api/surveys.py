@@ -315,18 +315,19 @@ class DisturbancesView(BaseModel):
     excluded_s: Annotated[list[list[float]], Field(description="what is left out of maps, by PATCH")]
 
 
-def _active_quality(session: Session, survey: Survey) -> tuple[str, str] | None:
-    """Id and quality report of the floor's active map, if it has one."""
-    active = session.scalars(select(Floor.active_map_id).where(Floor.id == survey.floor_id)).one()
-    row = session.get(Map, active) if active else None
-    return None if row is None or row.quality_sha256 is None else (row.id, row.quality_sha256)
-
-
-def _disturbances(context: Context, survey: Survey, quality: tuple[str, str] | None) -> list[DisturbanceView]:
-    told = list(survey.report.get("disturbances") or [])
-    if quality is not None:
-        told += json.loads(context.blobs.get(quality[1])).get("disturbances", {}).get(survey.id, [])
-    return sorted((DisturbanceView(**each) for each in told), key=lambda each: each.start_s)
+def _disturbances(context: Context, identity: Identity, survey_id: str) -> DisturbancesView:
+    """Told by the survey's report, and by the quality report of the floor's active map, if it has one."""
+    with context.transaction() as session:
+        survey = find_own(session, identity, Survey, survey_id)
+        active = session.scalars(select(Floor.active_map_id).where(Floor.id == survey.floor_id)).one()
+        row = session.get(Map, active) if active else None
+        quality_sha256 = None if row is None else row.quality_sha256
+        map_id = None if row is None or quality_sha256 is None else row.id
+        told, excluded_s = list(survey.report.get("disturbances") or []), survey.excluded_s or []
+    if quality_sha256 is not None:
+        told += json.loads(context.blobs.get(quality_sha256)).get("disturbances", {}).get(survey_id, [])
+    stretches = sorted((DisturbanceView(**each) for each in told), key=lambda each: each.start_s)
+    return DisturbancesView(survey_id=survey_id, map_id=map_id, stretches=stretches, excluded_s=excluded_s)
 
 
 @router.get("/surveys/{survey_id}/disturbances", summary="Where the field was disturbed while it was walked")
@@ -334,15 +335,7 @@ def get_disturbances(survey_id: Id, context: ContextDep, identity: SurveyReading
     """What the walk shows by itself (a step, a hum, a change while standing still, a place that read otherwise before),
     and where it departs from the floor's active map of the other surveys. Nothing is left out of maps by itself: PATCH
     the survey with `exclude_disturbed` or with stretches of your own, `excluded_s`."""
-    with context.transaction() as session:
-        survey = find_own(session, identity, Survey, survey_id)
-        quality = _active_quality(session, survey)
-        return DisturbancesView(
-            survey_id=survey_id,
-            map_id=None if quality is None else quality[0],
-            stretches=_disturbances(context, survey, quality),
-            excluded_s=survey.excluded_s or [],
-        )
+    return _disturbances(context, identity, survey_id)
 
 
 @router.get("/surveys/{survey_id}/samples", summary="The samples as the map sees them")
@@ -368,6 +361,9 @@ def get_samples(
 
 @router.patch("/surveys/{survey_id}", summary="Leave a survey out of maps, or take it in again")
 def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> PatchedSurvey:
+    disturbed = []
+    if "exclude_disturbed" in body.model_fields_set:
+        disturbed = [[each.start_s, each.end_s] for each in _disturbances(context, identity, survey_id).stretches]
     with context.transaction() as session:
         survey = _lock_survey(session, identity, survey_id)
         before = survey.included, survey.excluded_s or []
@@ -375,9 +371,8 @@ def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity
             survey.included = body.included
         if "excluded_s" in body.model_fields_set:
             survey.excluded_s = checked_stretches(body.excluded_s, "/body/excluded_s")
-        if "exclude_disturbed" in body.model_fields_set:
-            found = _disturbances(context, survey, _active_quality(session, survey))
-            survey.excluded_s = union_s([*(survey.excluded_s or []), *([each.start_s, each.end_s] for each in found)])
+        if disturbed:
+            survey.excluded_s = union_s([*(survey.excluded_s or []), *disturbed])
         changed = before != (survey.included, survey.excluded_s or []) and (before[0] or survey.included)
         session.flush()
         job = _rebuild(session, context, survey.floor_id) if changed else None

@@ -41,7 +41,7 @@ from app.api.track_request import NewTrack, StepsBody, core_options, core_prior,
 from app.db.tables import Building, Floor, Track, TrackSteps
 from app.errors import Conflict, Fault, InvalidInput, TooMany
 from app.services.calibrations import find_calibration
-from app.services.estimate_attitude import AskedReference, check_vector, find_reference
+from app.services.estimate_attitude import check_vector, earth_as_reference
 from app.services.locate_window import ActiveMap, active_maps
 from app.services.replay_track import ReplayedBatch, replay_track
 from app.services.step_order import RawStep
@@ -96,9 +96,8 @@ def _attitude(
             check_vector(context.grids.grid(each.grid_sha256))
     if kind != "wmm":
         return {"reference": kind}
-    asked = AskedReference("wmm", floor.building_id, None, None, 0.0, None, None, datetime.now(UTC).date())
-    _, told = find_reference(session, context.grids, identity.organisation_id, asked)
-    return {"reference": kind, **told}
+    today = datetime.now(UTC).date()
+    return {"reference": kind} | earth_as_reference(session, identity.organisation_id, floor.building_id, None, today)
 
 
 def _check_count(session: Session, context: Context, identity: Identity) -> None:

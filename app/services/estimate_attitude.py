@@ -5,7 +5,7 @@ from datetime import date
 from typing import Any, Literal
 
 import numpy as np
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, sessionmaker
 
 from app.attitude.mekf import AttitudeRun, begin, follow_attitude
 from app.attitude.options import AttitudeOptions, InertialSamples
@@ -25,7 +25,14 @@ from app.services.earth_reference import earth_at_building, told_model
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
 
-__all__ = ["AskedReference", "ReferenceKind", "check_vector", "estimate_attitude", "find_reference"]
+__all__ = [
+    "AskedReference",
+    "ReferenceKind",
+    "check_vector",
+    "earth_as_reference",
+    "estimate_attitude",
+    "find_reference",
+]
 
 ReferenceKind = Literal["none", "learned", "level", "wmm", "map_point", "map"]
 STEEL_UT = 5.0  # sd per axis by which the field of a building departs from the Earth's
@@ -54,7 +61,7 @@ def estimate_attitude(
 
 
 def find_reference(
-    session: Session, grids: GridCache, organisation_id: str, asked: AskedReference
+    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: AskedReference
 ) -> tuple[MagneticReference | None, dict[str, Any]]:
     """The reference, and what it was, as JSON. Raises NotFound, Conflict (no map), IncompatibleFrames, InvalidInput."""
     if asked.kind == "none":
@@ -67,30 +74,32 @@ def find_reference(
         told = {"horizontal_ut": asked.horizontal_uT, "vertical_ut": asked.vertical_uT}
         return level_reference(asked.horizontal_uT, asked.vertical_uT), told
     if asked.kind == "wmm":
-        return _earth(session, organisation_id, asked)
-    return _of_map(session, grids, organisation_id, asked)
+        with sessions() as session:
+            told = earth_as_reference(session, organisation_id, asked.building_id, asked.floor_id, asked.on)
+        return constant_reference(np.array(told["b_ut"]), told["sd_ut"]), told
+    return _of_map(sessions, grids, organisation_id, asked)
 
 
-def _earth(session: Session, organisation_id: str, asked: AskedReference) -> tuple[MagneticReference, dict[str, Any]]:
-    building_id = asked.building_id
+def earth_as_reference(
+    session: Session, organisation_id: str, building_id: str | None, floor_id: str | None, on: date
+) -> dict[str, Any]:
+    """The Earth's field in a building, or in that of a floor, as JSON: `b_ut` in its frame, and `sd_ut` per axis."""
     if building_id is None:
-        floor = session.get(Floor, asked.floor_id)
+        floor = session.get(Floor, floor_id)
         if floor is None or floor.organisation_id != organisation_id:
-            raise NotFound(f"no floor {asked.floor_id}")
+            raise NotFound(f"no floor {floor_id}")
         building_id = floor.building_id
-    field, anchor = earth_at_building(
-        session, organisation_id, building_id, asked.on, "/body/reference/building_id"
-    )  # fmt: skip
-    B_uT = field_in_building_uT(field, anchor)
-    return constant_reference(B_uT, STEEL_UT), told_model(field) | {"b_ut": B_uT.tolist(), "sd_ut": STEEL_UT}
+    field, anchor = earth_at_building(session, organisation_id, building_id, on, "/body/reference/building_id")
+    return told_model(field) | {"b_ut": field_in_building_uT(field, anchor).tolist(), "sd_ut": STEEL_UT}
 
 
 def _of_map(
-    session: Session, grids: GridCache, organisation_id: str, asked: AskedReference
+    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: AskedReference
 ) -> tuple[MagneticReference, dict[str, Any]]:
     assert asked.floor_id is not None
     assert asked.position_m is not None
-    maps = active_maps(session.connection(), organisation_id, floor_ids=[asked.floor_id])
+    with sessions() as session:
+        maps = active_maps(session.connection(), organisation_id, floor_ids=[asked.floor_id])
     if not maps:
         raise Conflict(f"floor {asked.floor_id} has no map yet; upload surveys and wait for its job")
     grid = grids.grid(maps[0].grid_sha256)
