@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Engine, inspect, select, text
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.engine import create_database_engine, downgrade, migrate, teach_old_sqlite
-from app.db.tables import Base, Map, Organisation
+from app.db.tables import Base, Map, Organisation, Survey
 from app.errors import InvalidInput
 
 ROOT = Path(__file__).parents[2]
@@ -66,6 +66,9 @@ def test_a_map_made_before_layers_stays_when_the_schema_grows_and_shrinks(fresh_
                   "auto_build": True, "claimed_generation": 0, "build_sequence": 1, "active_sequence": 1},
         "map": {"id": "m", "organisation_id": "o", "floor_id": "f", "status": "ready", "sequence": 1, "activate": True,
                 "spec": "{}", "survey_ids": "[]", "grid_sha256": "0" * 64},
+        "survey": {"id": "s", "organisation_id": "o", "floor_id": "f", "name": "s", "format": "csv",
+                   "frame": "building", "raw_sha256": "1" * 64, "samples_sha256": "2" * 64, "sample_count": 7,
+                   "report": '{"samples": 7}', "included": True},
     }  # fmt: skip
     with engine.begin() as connection:
         for table, row in rows.items():
@@ -76,6 +79,9 @@ def test_a_map_made_before_layers_stays_when_the_schema_grows_and_shrinks(fresh_
     with Session(engine) as session:
         row = session.get_one(Map, "m")
         assert (row.grid_sha256, row.layers_sha256, row.state_sha256) == ("0" * 64, None, None)
+        survey = session.get_one(Survey, "s")
+        assert (survey.report, survey.included, survey.sample_count) == ({"samples": 7}, True, 7)
+        assert (survey.calibration_id, survey.excluded_s) == (None, None)
     downgrade(engine, "0001")
     migrate(engine)
     with engine.connect() as connection:
