@@ -206,12 +206,19 @@ def _options(body: AttitudeQuery, t_s: Array, position_m: Array | None) -> Attit
     suited: dict[str, Any] = {}
     if body.reference.kind == "map":
         assert position_m is not None
-        suited = {"field_uT": MAPPED_FIELD_UT}
-        elapsed_s = t_s[-1] - t_s[0]
-        if elapsed_s > 0.0:
-            walked_m = float(np.linalg.norm(np.diff(position_m[:, :2], axis=0), axis=1).sum())
-            suited["speed_m_per_s"] = max(AttitudeOptions().speed_m_per_s, walked_m / elapsed_s)
+        suited = {"field_uT": MAPPED_FIELD_UT, "speed_m_per_s": _speed_m_per_s(t_s, position_m)}
     return AttitudeOptions(**(suited | told))
+
+
+def _speed_m_per_s(t_s: Array, position_m: Array) -> float:
+    """Root mean square over whole seconds, so that what jitters is not taken for speed; a walk's usual at least."""
+    usual = AttitudeOptions().speed_m_per_s
+    if t_s[-1] - t_s[0] < 1.0:
+        return usual
+    at = np.linspace(t_s[0], t_s[-1], min(int(t_s[-1] - t_s[0]) + 1, len(t_s)))
+    place = np.stack([np.interp(at, t_s, position_m[:, k]) for k in (0, 1)], axis=1)
+    moved = np.diff(place, axis=0) / (at[1] - at[0])
+    return max(usual, float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))))
 
 
 def _shown(run: AttitudeRun, samples: InertialSamples, every: int) -> dict[str, Any]:

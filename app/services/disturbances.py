@@ -4,7 +4,7 @@ A stretch that is excluded stays in the survey; maps are built without it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -53,9 +53,9 @@ def without_stretches(samples: Samples, excluded_s: Stretches) -> Samples:
     for start_s, end_s in excluded_s:
         kept &= (samples.t_s < start_s) | (samples.t_s > end_s)
     q = samples.q_body_to_building
-    return Samples(
-        samples.t_s[kept], samples.p_building_m[kept], samples.B_uT[kept], samples.frame,
-        None if q is None else q[kept], samples.session,
+    return replace(
+        samples, t_s=samples.t_s[kept], p_building_m=samples.p_building_m[kept], B_uT=samples.B_uT[kept],
+        q_body_to_building=None if q is None else q[kept],
     )  # fmt: skip
 
 

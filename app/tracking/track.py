@@ -174,7 +174,6 @@ def _weigh(
 ) -> tuple[TrackState, tuple[Smoothed, ...]]:  # fmt: skip
     """Particles moved to the reading, weighed by it, and resampled when few of them count."""
     assert state.particles is not None
-    assert state.lag is not None
     options = tracker.options
     noise = rng.standard_normal((len(state.particles), DRAWS), dtype=np.float32)
     particles, move, state = _advanced(tracker, state, state.particles, move, noise)

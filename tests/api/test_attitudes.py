@@ -308,3 +308,15 @@ def test_inertial_samples_need_a_track_with_attitude_and_increasing_times(
     told = service.http.post(path, json={"steps": [steps[1]]}).json()["estimate"]["attitude"]
     again = steps[1] | {"number": 2}
     assert service.http.post(path, json={"steps": [again]}).json()["estimate"]["attitude"] == told
+
+
+def test_places_that_jitter_are_not_taken_for_speed(service: Any, anchored_floor: str, carried: Any) -> None:
+    """White errors of 0.1 m fifty times a second look like 7 m/s, with which the accelerometer would tell nothing."""
+    columns, p, truth = carried
+    jittering = p + np.random.default_rng(1).normal(0.0, 0.1, p.shape) * [1.0, 1.0, 0.0]
+    told = ask(service, columns, {"kind": "map", "floor_id": anchored_floor, "position_m": jittering.tolist(),
+                                  "position_sd_m": 0.1})  # fmt: skip
+    heading, tilt = errors_deg(told, truth)
+    assert np.sqrt(np.mean(heading**2)) < 3.0
+    assert np.sqrt(np.mean(tilt**2)) < 2.0
+    assert np.sqrt(np.mean(np.square(told["pitch_sd_rad"]))) < 0.05
