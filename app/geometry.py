@@ -16,6 +16,7 @@ __all__ = [
     "UT_PER_NANOTESLA",
     "Array",
     "horizontal_and_vertical",
+    "path_length_m",
     "rotate_by_quaternion",
     "wrap_angle_rad",
     "yaw_matrix",
@@ -37,6 +38,12 @@ def yaw_matrix(heading_rad: float) -> Array:
     """The 3 x 3 rotation Rz(heading) taking level-frame vectors to the building frame."""
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def path_length_m(p_m: Array) -> Array:
+    """(n,) distance walked since the first of positions (n, 2 or 3), along the floor."""
+    steps = np.linalg.norm(np.diff(p_m[:, :2], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def rotate_by_quaternion(q_wxyz: Array, v: Array) -> Array:

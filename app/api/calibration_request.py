@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from fastapi import Query
-from pydantic import AfterValidator, AwareDatetime, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, AwareDatetime, ConfigDict, Field, model_validator
 
 from app.api.locate_request import FloorId, Quaternion, Vector
 from app.api.models import Finite, Name, Point, RequestModel
@@ -29,8 +29,7 @@ CalibrationId = Annotated[
     ),
 ]
 DeviceQuery = Annotated[
-    Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")] | None,
-    Query(description="the same by name: its newest calibration", examples=["robot-7"]),
+    Name | None, Query(description="the same by name: its newest calibration", examples=["robot-7"])
 ]
 
 

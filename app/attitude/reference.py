@@ -12,9 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.errors import Fault, InvalidInput
+from app.field.grid import FieldGrid
 from app.geometry import Array
 
-__all__ = ["MagneticReference", "constant_reference", "learned_reference", "level_reference", "map_reference"]
+__all__ = [
+    "MagneticReference",
+    "constant_reference",
+    "grid_reference",
+    "learned_reference",
+    "level_reference",
+    "map_reference",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +78,14 @@ def constant_reference(B_uT: Array, sd_uT: float = 0.0) -> MagneticReference:
 def level_reference(horizontal_uT: float, vertical_uT: float, sd_uT: float = 0.0) -> MagneticReference:
     """Strengths alone, vertical up: the building's x axis is then magnetic north, and yaw is counted from it."""
     return MagneticReference(np.array([horizontal_uT, 0.0, vertical_uT]), sd_uT**2)
+
+
+def grid_reference(grid: FieldGrid, p_building_m: Array, position_covariance_m2: Array) -> MagneticReference:
+    """A map at places (n, 3) uncertain by a covariance (2, 2) along the floor; nothing is known where unmapped."""
+    values = grid.at(p_building_m)
+    mean_uT = np.where(values.measured[:, None], values.mean_uT, np.nan)
+    sd_uT = np.hypot(values.sd_uT, grid.noise_sd_uT)
+    return map_reference(mean_uT, sd_uT, values.gradient_uT_per_m[:, :, :2], position_covariance_m2)
 
 
 def map_reference(

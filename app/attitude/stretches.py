@@ -17,7 +17,7 @@ from app.attitude.disturbance import check_log
 from app.attitude.standstill import find_changes_at_rest, typical_gradient_uT_per_m
 from app.attitude.sudden_changes import ORDER, Step, find_hum, find_steps, find_stuck, white_noise_sd_uT
 from app.errors import Fault, InvalidInput
-from app.geometry import Array
+from app.geometry import Array, path_length_m
 
 __all__ = ["DisturbedStretch", "StretchKind", "disturbed_samples", "find_departures", "find_disturbed_stretches"]
 
@@ -89,7 +89,7 @@ def find_disturbed_stretches(
 
 def find_departures(t_s: Array, B_uT: Array, p_building_m: Array, expected: Expected) -> list[DisturbedStretch]:
     """The stretches of kind "map" alone: where readings (n, c) depart from what other surveys lead one to expect."""
-    return [_departed(t_s, each, "map") for each in departures(t_s, _path_m(p_building_m), B_uT, expected)]
+    return [_departed(t_s, each, "map") for each in departures(t_s, path_length_m(p_building_m), B_uT, expected)]
 
 
 def disturbed_samples(t_s: Array, stretches: tuple[DisturbedStretch, ...]) -> NDArray[np.bool_]:
@@ -98,10 +98,6 @@ def disturbed_samples(t_s: Array, stretches: tuple[DisturbedStretch, ...]) -> ND
     for each in stretches:
         out |= (t_s >= each.start_s) & (t_s <= each.end_s)
     return out
-
-
-def _path_m(p_m: Array) -> Array:
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_m[:, :2], axis=0), axis=1))])
 
 
 def _sudden(t: Array, B: Array) -> list[DisturbedStretch]:
@@ -159,7 +155,7 @@ def _paired(t: Array, steps: list[Step]) -> list[DisturbedStretch]:
 
 
 def _slow(t: Array, B: Array, p: Array, attitude_sd_rad: float) -> list[DisturbedStretch]:
-    noise, path_m = white_noise_sd_uT(B), _path_m(p)
+    noise, path_m = white_noise_sd_uT(B), path_length_m(p)
     gradient = typical_gradient_uT_per_m(path_m, B)
     still = [
         _stretch(

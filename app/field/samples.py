@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from app.errors import IncompatibleFrames
-from app.geometry import Array, horizontal_and_vertical
+from app.geometry import Array, horizontal_and_vertical, path_length_m
 
 __all__ = ["COMPONENT_NAMES", "Components", "SampleFrame", "Samples", "richest_components"]
 
@@ -73,8 +73,7 @@ class Samples:
 
     def path_length_m(self) -> Array:
         """(n,) distance walked since the first sample, along the floor."""
-        steps = np.linalg.norm(np.diff(self.p_building_m[:, :2], axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return path_length_m(self.p_building_m)
 
 
 def richest_components(frames: set[SampleFrame]) -> Components:

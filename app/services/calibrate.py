@@ -20,7 +20,7 @@ from app.calibration.two_step import two_step
 from app.earth_field import EarthField, earth_field
 from app.errors import Conflict, Fault, InvalidInput
 from app.field.grid import FieldGrid
-from app.geometry import Array
+from app.geometry import Array, path_length_m
 from app.positioning.window import Window
 from app.services.calibrate_on_map import calibrate_on_map
 from app.services.earth_reference import earth_at_building, told_model
@@ -183,7 +183,7 @@ def _along(grid: FieldGrid, B_uT: Array, rotation: Array, walk: MappedWalk) -> t
         rotation[kept],
         values.mean_uT[kept],
         values.sd_uT[kept] ** 2 + walk.position_sd_m**2 * (slope**2).sum(axis=2),
-        path_m=_path_m(walk.way_m[kept]),
+        path_m=path_length_m(walk.way_m[kept]),
     )
     return fit, {"position_sd_m": walk.position_sd_m, "mapped_readings": int(kept.sum())}
 
@@ -194,7 +194,3 @@ def _check_unit(q: Array) -> None:
         at = int(np.argmax(wrong))
         reason = f"its norm is {np.linalg.norm(q[at]):.3g}, not 1"
         raise InvalidInput(f"orientation {at} is no unit quaternion", Fault(f"/body/walk/orientation/{at}", reason))
-
-
-def _path_m(p_m: Array) -> Array:
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_m, axis=0), axis=1))])

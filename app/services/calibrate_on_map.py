@@ -17,7 +17,7 @@ from app.calibration.map_aided import map_aided
 from app.calibration.sensor_model import SensorModel
 from app.errors import Fault, InvalidInput
 from app.field.grid import FieldGrid
-from app.geometry import Array, yaw_matrix
+from app.geometry import Array, path_length_m, yaw_matrix
 from app.positioning.explanation import ExplainedPlace
 from app.positioning.fix import Fix, LocateOptions
 from app.positioning.locate import SearchableFloor, locate_and_explain
@@ -115,7 +115,7 @@ def offset_by_turns(
     """
     y = np.asarray(window.B_uT, dtype=np.float64).ravel()
     design = np.concatenate([np.broadcast_to(np.eye(3), device_to_frame.shape), device_to_frame], axis=2).reshape(-1, 6)
-    walked_m = float(_path_m(np.asarray(window.displacement_m, dtype=np.float64))[-1])
+    walked_m = float(path_length_m(np.asarray(window.displacement_m, dtype=np.float64))[-1])
     independent = max(1.0, walked_m / STEEL_M) / len(window.B_uT)
     prior_sd = np.array([EARTH_UT, EARTH_UT, STEEL_UT, *np.full(3, hard_iron_sd_uT)])
     covariance = np.linalg.inv(design.T @ design * independent / STEEL_UT**2 + np.diag(prior_sd**-2.0))
@@ -167,7 +167,7 @@ def way_of(window: Window, device_to_frame: Array, place: ExplainedPlace, covari
     assert place.heading_rad is not None
     d = np.asarray(window.displacement_m, dtype=np.float64)[:, :2]
     step = np.diff(d, axis=0)
-    path = _path_m(d)
+    path = path_length_m(d)
     device_yaw = _device_yaw_rad(device_to_frame)[-1]
     bend = place.heading_drift_rad_per_m * (path - path[-1])
     heading = place.heading_rad - device_yaw + bend  # of the window's frame at each sample
@@ -189,7 +189,7 @@ def with_sensor(window: Window, device_to_frame: Array, model: SensorModel) -> W
 
 def _thinned(window: Window) -> Window:
     """The first and the last sample and one a metre between."""
-    path = _path_m(np.asarray(window.displacement_m, dtype=np.float64))
+    path = path_length_m(np.asarray(window.displacement_m, dtype=np.float64))
     _, kept = np.unique(np.floor(path / SPACING_M), return_index=True)
     kept = np.unique(np.append(kept, len(path) - 1))
 
@@ -200,12 +200,6 @@ def _thinned(window: Window) -> Window:
         window, B_uT=window.B_uT[kept], displacement_m=window.displacement_m[kept], t_s=thin(window.t_s),
         yaw_rad=thin(window.yaw_rad), device_to_frame=thin(window.device_to_frame),
     )  # fmt: skip
-
-
-def _path_m(displacement_m: Array) -> Array:
-    """(n,) walked since the start, of displacements (n, 2 or 3), along the floor."""
-    step = np.linalg.norm(np.diff(displacement_m[:, :2], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(step)])
 
 
 def _device_to_frame(window: Window) -> Array:

@@ -12,14 +12,14 @@ from app.attitude.options import AttitudeOptions, InertialSamples
 from app.attitude.reference import (
     MagneticReference,
     constant_reference,
+    grid_reference,
     learned_reference,
     level_reference,
-    map_reference,
 )
 from app.db.tables import Floor
 from app.earth_field import field_in_building_uT
 from app.errors import Conflict, Fault, IncompatibleFrames, InvalidInput, NotFound
-from app.field.grid import FieldGrid, FieldValues
+from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.services.earth_reference import earth_at_building, told_model
 from app.services.grid_cache import GridCache
@@ -104,17 +104,18 @@ def _of_map(
         raise Conflict(f"floor {asked.floor_id} has no map yet; upload surveys and wait for its job")
     grid = grids.grid(maps[0].grid_sha256)
     check_vector(grid)
-    values = grid.at(asked.position_m)
     told: dict[str, Any] = {"floor_id": asked.floor_id, "map_id": maps[0].map_id}
     if asked.kind == "map_point":
+        values = grid.at(asked.position_m)
         if not values.measured[0]:
             reason = "nothing is mapped at this point"
             raise InvalidInput(reason, Fault("/body/reference/position_m", reason))
         wander = grid.prior_sd_uT  # the field where the device is differs from that of the point by as much
         told |= {"b_ut": values.mean_uT[0].tolist(), "sd_ut": wander.tolist()}
         return MagneticReference(values.mean_uT[0], np.square(wander)), told
-    mapped = float(values.measured.mean())
-    return at_places(grid, values, asked.position_sd_m**2 * np.eye(2)), told | {"mapped_share": mapped}
+    reference = grid_reference(grid, asked.position_m, asked.position_sd_m**2 * np.eye(2))
+    assert reference.B_uT is not None
+    return reference, told | {"mapped_share": float(np.isfinite(reference.B_uT).all(axis=1).mean())}
 
 
 def check_vector(grid: FieldGrid) -> None:
@@ -123,14 +124,3 @@ def check_vector(grid: FieldGrid) -> None:
         raise IncompatibleFrames(
             f"a {grid.components} map does not tell the field's direction; survey the floor with orientation"
         )
-
-
-def at_places(grid: FieldGrid, values: FieldValues, covariance_m2: Array) -> MagneticReference:
-    """The map at places (n, 3) of which each component is uncertain by covariance_m2 (2, 2), on the floor.
-
-    Nothing is known where nothing is mapped.
-    """
-    mean = np.where(values.measured[:, None], values.mean_uT, np.nan)
-    slope = values.gradient_uT_per_m[:, :, :2]
-    sd = np.hypot(values.sd_uT, grid.noise_sd_uT)
-    return map_reference(mean, np.where(values.measured[:, None], sd, np.nan), slope, covariance_m2)

@@ -99,14 +99,10 @@ def _turned_axes(samples: Samples, middle: Array, earth_uT: Array, bearing_known
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         if samples.frame == "level" and order != (0, 1, 2):
             continue  # the median horizontal length is no axis
-        left = off(np.array(signs) * _axes(samples, middle)[list(order)])
+        left = off(np.array(signs) * middle[list(order)])
         if left < best - 1e-9 and left < AXES_GAIN * as_is:
             best, name = left, _axes_name(order, signs, flat)
     return name
-
-
-def _axes(samples: Samples, middle: Array) -> Array:
-    return middle if samples.frame == "level" else np.asarray(np.median(samples.B_uT, axis=0))
 
 
 def _axes_name(order: tuple[int, ...], signs: tuple[float, ...], flat: bool) -> str:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from app.attitude.mekf import AttitudeState, begin, follow_attitude
 from app.attitude.options import AttitudeOptions, InertialSamples
-from app.attitude.reference import MagneticReference, constant_reference, map_reference
+from app.attitude.reference import MagneticReference, constant_reference, grid_reference
 from app.geometry import Array
 from app.tracking.estimate import Estimate
 from app.tracking.step import Step
@@ -56,7 +56,7 @@ def oriented(
     samples = _later(step.inertial, state.attitude)
     if not len(samples) or (state.attitude is None and not np.isfinite(samples.accelerometer_m_per_s2).all(1).any()):
         return step, state
-    compared = _reference(tracker, state, estimate, len(samples))
+    compared = _reference(tracker, state, estimate)
     options = AttitudeOptions(speed_m_per_s=max(AttitudeOptions().speed_m_per_s, tracker.options.speed_m_s))
     before = state.attitude or begin(samples, compared, options)
     after, run = follow_attitude(before, samples, compared, options)
@@ -82,9 +82,7 @@ def _later(samples: InertialSamples, before: AttitudeState | None) -> InertialSa
     )  # fmt: skip
 
 
-def _reference(
-    tracker: "Tracker", state: "TrackState", estimate: Estimate | None, samples: int
-) -> MagneticReference | None:
+def _reference(tracker: "Tracker", state: "TrackState", estimate: Estimate | None) -> MagneticReference | None:
     told = tracker.attitude
     assert told is not None
     if told.kind == "none":
@@ -92,13 +90,7 @@ def _reference(
     if told.kind == "constant":
         assert told.B_uT is not None
         return constant_reference(told.B_uT, told.sd_uT)
-    nothing = MagneticReference(np.full(3, np.nan), 0.0)
     if estimate is None or state.state != "converged":
-        return nothing
+        return MagneticReference(np.full(3, np.nan), 0.0)
     grid = tracker.floors[estimate.floor].grid
-    values = grid.at(np.array([estimate.position_m]))
-    if not values.measured[0]:
-        return nothing
-    sd = np.hypot(values.sd_uT, grid.noise_sd_uT)
-    slope = values.gradient_uT_per_m[:, :, :2]
-    return map_reference(values.mean_uT, sd, slope, estimate.covariance_m2)
+    return grid_reference(grid, np.array([estimate.position_m]), estimate.covariance_m2)

@@ -6,11 +6,13 @@ import pytest
 from app.attitude.reference import (
     MagneticReference,
     constant_reference,
+    grid_reference,
     learned_reference,
     level_reference,
     map_reference,
 )
 from app.errors import InvalidInput
+from app.field.grid import FieldGrid
 
 
 def test_a_variance_may_be_told_in_five_shapes() -> None:
@@ -66,3 +68,16 @@ def test_the_others() -> None:
         MagneticReference(np.ones(3), np.ones((2, 2))).rows(5)
     with pytest.raises(InvalidInput, match="not finite"):
         MagneticReference(np.ones(3), np.nan).rows(5)
+
+
+def test_a_map_says_nothing_of_places_it_does_not_hold(hall_grid: FieldGrid) -> None:
+    """One place alone, as a track asks, and among others: nothing is known there, and nothing fails."""
+    reference = grid_reference(hall_grid, np.array([[5.0, 4.0, 1.2], [99.0, 4.0, 1.2]]), 0.01 * np.eye(2))
+    B, variance = reference.rows(2)
+    assert np.isfinite(B[0]).all()
+    assert np.isnan(B[1]).all()
+    expected = np.square(0.3) + np.square(0.4)
+    slope = hall_grid.at(np.array([[5.0, 4.0]])).gradient_uT_per_m[0, :, :2]
+    np.testing.assert_allclose(variance[0], expected * np.eye(3) + 0.01 * slope @ slope.T, rtol=1e-6)
+    alone, _ = grid_reference(hall_grid, np.array([[99.0, 4.0, 1.2]]), np.eye(2)).rows(1)
+    assert np.isnan(alone).all()
