@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.blobs import BlobStore, FolderBlobStore, open_blob_store
-from app.errors import CorruptArtefact, InvalidInput, NotFound
+from app.errors import CorruptArtefact, InvalidInput, NotFound, Unavailable
 
 ROOT = Path(__file__).parents[1]
 ABSENT = hashlib.sha256(b"never stored").hexdigest()
@@ -177,16 +178,52 @@ class TestFolderBlobStore(BlobStoreContract):
     def test_a_full_disk_leaves_nothing(self, tmp_path: Path) -> None:
         code = (
             "import resource, signal, sys; from pathlib import Path; from app.blobs import FolderBlobStore\n"
+            "from app.errors import Unavailable\n"
             "store = FolderBlobStore(Path(sys.argv[1])); signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
             "try: store.put(b'x' * 5000)\n"
-            "except OSError: sys.exit(7)\n"
+            "except Unavailable: sys.exit(7)\n"
         )
         run = subprocess.run(
             [sys.executable, "-c", code, str(tmp_path)], env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False
         )
         assert run.returncode == 7
         assert [file for file in tmp_path.rglob("*") if file.is_file() and file.name != "lock"] == []
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 1 MiB. Without the right to mount one the test is skipped, but where `CI` is set it fails."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", place], capture_output=True, text=True)
+    if mounted.returncode:
+        reason = f"no disk can be mounted here: {mounted.stderr.strip()}"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    yield place
+    subprocess.run(["umount", "--lazy", place], check=False)
+
+
+def test_what_a_disk_refuses_is_for_now_and_is_said(disk: Path) -> None:
+    store = FolderBlobStore(disk / "blobs")
+    kept = store.put(b"magnetite")
+    with pytest.raises(Unavailable, match=r"no space left on device.*isodyn clean"):
+        store.put(os.urandom(2**20))
+    assert store.get(kept) == b"magnetite"
+    assert [blob.sha256 for blob in store.stored()] == [kept]
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    for refused in (lambda: store.put(b"hematite"), lambda: store.discard(kept)):
+        with pytest.raises(Unavailable, match=r"read-only file system.*mount it for writing"):
+            refused()
+    assert FolderBlobStore(disk / "blobs").get(kept) == b"magnetite"
+    subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
+    assert store.get(store.put(b"hematite")) == b"hematite"
+    subprocess.run(["umount", "--lazy", disk], check=True)
+    for missed in (lambda: store.get(kept), lambda: store.exists(kept), lambda: store.put(b"goethite")):
+        with pytest.raises(Unavailable, match="is its disk mounted"):
+            missed()
 
 
 def test_addresses(tmp_path: Path) -> None:

@@ -2,8 +2,12 @@
 
 A blob is written under a temporary name in the same file system, forced to the disk, and renamed. The time of its file
 says when it was last put. A lock, `tmp/lock`, held for moments only, keeps putting and discarding by age apart.
+
+What the disk refuses (it is full, read-only, gone, failing) is Unavailable, as of a store that cannot be reached:
+nothing was acknowledged, and the same call does once the disk is well again.
 """
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -14,9 +18,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from app.blobs.store import StoredBlob, check_name, is_name
-from app.errors import CorruptArtefact, NotFound
+from app.errors import CorruptArtefact, NotFound, Unavailable
 
 __all__ = ["FolderBlobStore"]
+
+ADVICE = {
+    errno.ENOSPC: "make room, then send it again; `isodyn clean` forgets what nothing names",
+    errno.EDQUOT: "make room or raise the quota, then send it again",
+    errno.EROFS: "mount it for writing, then send it again",
+    errno.ENOENT: "is its disk mounted?",
+    errno.EACCES: "the process may not write there",
+}
 
 
 class FolderBlobStore:
@@ -25,24 +37,28 @@ class FolderBlobStore:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._temporary = folder / "tmp"
-        self._temporary.mkdir(parents=True, exist_ok=True)
+        with self._disk_at_hand():
+            self._temporary.mkdir(parents=True, exist_ok=True)
 
     def put(self, data: bytes) -> str:
         sha256 = hashlib.sha256(data).hexdigest()
         target = self._path(sha256)
-        if not (self._holds(target, sha256) and self._refresh(target)):
-            self._write(target, data)
-        # Also when another process has just renamed it: what this call acknowledges must outlive a power cut. A new
-        # folder is on the disk once the folder that names it is.
-        for folder in (target.parent, target.parent.parent, self._folder):
-            _sync_folder(folder)
+        with self._disk_at_hand():
+            if not (self._holds(target, sha256) and self._refresh(target)):
+                self._write(target, data)
+            # Also when another process has just renamed it: what this call acknowledges must outlive a power cut. A
+            # new folder is on the disk once the folder that names it is.
+            for folder in (target.parent, target.parent.parent, self._folder):
+                _sync_folder(folder)
         return sha256
 
     def get(self, sha256: str) -> bytes:
         check_name(sha256)
         try:
-            data = self._path(sha256).read_bytes()
+            with self._disk_at_hand(but=FileNotFoundError):
+                data = self._path(sha256).read_bytes()
         except FileNotFoundError:
+            self._look_for_folder()
             raise NotFound(f"no blob {sha256} in the store: was the blob folder moved or cleaned?") from None
         if hashlib.sha256(data).hexdigest() != sha256:
             raise CorruptArtefact(
@@ -53,16 +69,20 @@ class FolderBlobStore:
 
     def exists(self, sha256: str) -> bool:
         check_name(sha256)
-        return self._path(sha256).is_file()
+        if self._path(sha256).is_file():
+            return True
+        self._look_for_folder()
+        return False
 
     def discard(self, sha256: str) -> None:
         check_name(sha256)
-        self._path(sha256).unlink(missing_ok=True)
+        with self._disk_at_hand():
+            self._path(sha256).unlink(missing_ok=True)
 
     def discard_older(self, sha256: str, before: datetime) -> bool:
         check_name(sha256)
         path = self._path(sha256)
-        with self._locked(fcntl.LOCK_EX):
+        with self._disk_at_hand(), self._locked(fcntl.LOCK_EX):
             try:
                 if datetime.fromtimestamp(path.stat().st_mtime, UTC) >= before:
                     return False
@@ -80,6 +100,23 @@ class FolderBlobStore:
             except FileNotFoundError:  # discarded meanwhile
                 continue
             yield StoredBlob(path.name, told.st_size, datetime.fromtimestamp(told.st_mtime, UTC))
+
+    def _look_for_folder(self) -> None:
+        """Raises Unavailable where the whole folder is gone, not a blob: its disk was unmounted, say."""
+        with self._disk_at_hand():
+            self._temporary.stat()
+
+    @contextmanager
+    def _disk_at_hand(self, but: type[OSError] | tuple[()] = ()) -> Iterator[None]:
+        """What the disk refuses is Unavailable, all but one kind of error."""
+        try:
+            yield
+        except but:
+            raise
+        except OSError as error:
+            why = (error.strerror or type(error).__name__).lower()
+            more = f": {ADVICE[error.errno]}" if error.errno in ADVICE else ""
+            raise Unavailable(f"the blob folder cannot be used now ({why}){more}") from error
 
     def _path(self, sha256: str) -> Path:
         return self._folder / sha256[:2] / sha256[2:4] / sha256

@@ -21,7 +21,11 @@ class StoredBlob(NamedTuple):
 
 
 class BlobStore(Protocol):
-    """What every store keeps to; `BlobStoreContract` in the tests says it in full."""
+    """What every store keeps to; `BlobStoreContract` in the tests says it in full.
+
+    Every method raises Unavailable where the store cannot be used now (no answer, no disk, no room on it); then nothing
+    was acknowledged.
+    """
 
     def put(self, data: bytes) -> str:
         """Store bytes durably and return their SHA-256, 64 lower-case hexadecimal digits.
