@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install install-dev demo serve test test-slow lint format benchmarks evaluate evaluate-tracks gallery openapi lock clean
+.PHONY: help install install-dev demo serve test test-slow campaign fuzz lint format benchmarks evaluate evaluate-tracks gallery openapi lock clean
 
 help: ## Explain every target
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -40,6 +40,12 @@ test: install-dev ## Install, and run all tests but the slow ones
 
 test-slow: install-dev ## Run the slow tests
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+campaign: install-dev ## Kill and cut everything during 300 uploads, on both back ends (ARGS="--uploads 30")
+	$(BIN)/python -m tests.reliability.campaign $(ARGS)
+
+fuzz: install-dev ## 50,000 requests from the contract, 10,000 odd surveys and windows (ARGS="--contract 1000")
+	$(BIN)/python -m tests.reliability.fuzz $(ARGS)
 
 lint: install-dev ## Style, types and import contracts
 	$(BIN)/ruff check .

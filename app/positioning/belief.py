@@ -69,6 +69,8 @@ def believe(matched: Matched) -> Belief:
     gaussian = pose_gaussian(matched)
     optima = find_optima(matched, gaussian)
     peak = max(optima[0].objective, float(matched.score[0]))
+    # Of candidates alone by their own best: what is refined may be better by more than a float can tell.
+    lattice = np.exp(matched.score - matched.score[0])
     relative = np.exp(matched.score - peak)
     cell = np.array([plane.resolution_m for plane in matched.planes])
     untold = untold_variance_m2(matched.window.path_m) + matched.structure.position_sd_m**2
@@ -88,13 +90,13 @@ def believe(matched: Matched) -> Belief:
         nearest = _nearest(atoms, aligned.plane, aligned.fine.pose[0, :2])
         best = aligned.believed(float(atoms.mass[nearest]) / total)
     elsewhere = off_map(matched, peak)
-    nowhere, poor = elsewhere.mass / (elsewhere.mass + total), _poorly_measured(matched, relative)
+    nowhere, poor = elsewhere.mass / (elsewhere.mass + total), _poorly_measured(matched, lattice)
     atoms.mass = atoms.mass / total
     return Belief(
         atoms=atoms,
         modes=tuple(sorted(modes, key=lambda mode: -mode.probability)),
         best=best,
-        lattice_mass=relative / relative.sum(),
+        lattice_mass=lattice / lattice.sum(),
         log_ratio=log_ratio(optima, matched.options.mlr_min_distance_m),
         unmapped=nowhere + (1.0 - nowhere) * poor,
         off_map_distance2=elsewhere.distance2,

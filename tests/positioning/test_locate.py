@@ -359,3 +359,16 @@ def test_the_strongest_floor_may_be_strong_by_area_alone(grid_of: Callable) -> N
     assert fix.ml.floor_id == "small"
     assert fix.status == "ambiguous"
     assert sum(fix.posterior.floor_probability.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", [6, 18, 25])
+def test_a_refined_pose_better_by_more_than_a_float_tells_leaves_an_answer(seed: int, hall_grid: FieldGrid) -> None:
+    """Noise under a prior of a centimetre: no lattice pose comes within a thousand nats of the refined one."""
+    B = np.array([18.0, 3.0, -42.0]) + np.random.default_rng(seed).normal(0, 30, (11, 3))
+    walked = np.column_stack([np.linspace(0, 5, 11), np.zeros((11, 2))])
+    fix = locate(
+        Window("building", B, walked, 0.5), [prepare_floor("f", hall_grid)], composition="demeaned",
+        prior=Prior((4.0, 4.0, 1.2), 0.01),
+    )  # fmt: skip
+    assert fix.status == "inconsistent"
+    assert sum(fix.posterior.floor_probability.values()) == pytest.approx(1.0)
