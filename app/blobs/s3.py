@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
 from obstore.store import S3Store
 
+from app.blobs.observed import observed
 from app.blobs.store import StoredBlob, check_name
 from app.errors import CorruptArtefact, InvalidInput, NotFound, Unavailable
 
@@ -63,6 +64,7 @@ class S3BlobStore:
         self._endpoint = _endpoint()
         self._opened: S3Store | None = None
 
+    @observed
     def put(self, data: bytes) -> str:
         sha256 = hashlib.sha256(data).hexdigest()
         # Also where it is already: that costs no more than to read it, repairs damage, and makes it young again.
@@ -70,6 +72,7 @@ class S3BlobStore:
             self._client().put(_key(sha256), data, use_multipart=False)
         return sha256
 
+    @observed
     def get(self, sha256: str) -> bytes:
         check_name(sha256)
         try:
@@ -86,6 +89,7 @@ class S3BlobStore:
             )
         return data
 
+    @observed
     def exists(self, sha256: str) -> bool:
         check_name(sha256)
         client = self._client()
@@ -103,6 +107,7 @@ class S3BlobStore:
             return False
         return True
 
+    @observed
     def discard(self, sha256: str) -> None:
         check_name(sha256)
         try:
@@ -111,6 +116,7 @@ class S3BlobStore:
         except FileNotFoundError:  # some servers mind, S3 does not
             return
 
+    @observed
     def discard_older(self, sha256: str, before: datetime) -> bool:
         """As the contract has it, but for a put between looking and deleting, some milliseconds: S3 deletes without
         conditions (docs/storage.md)."""

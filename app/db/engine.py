@@ -17,6 +17,7 @@ from sqlalchemy.engine import URL
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.db.traced import trace_statements
 from app.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -44,7 +45,9 @@ def create_database_engine(url: str) -> Engine:
     """An engine for `sqlite:///file` or `postgresql+psycopg://`. Raises InvalidInput for any other address."""
     parsed = _checked(url)
     if parsed.get_backend_name() == "postgresql":
-        return create_engine(parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800)
+        engine = create_engine(parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800)
+        trace_statements(engine)
+        return engine
     engine = create_engine(
         parsed,
         pool_size=10,
@@ -53,6 +56,7 @@ def create_database_engine(url: str) -> Engine:
     )
     event.listen(engine, "connect", _prepare_sqlite_connection)
     event.listen(engine, "savepoint", _begin_before_savepoint)
+    trace_statements(engine)
     return engine
 
 
