@@ -76,7 +76,9 @@ def register_workflows(context: WorkflowContext) -> None:
         if "failed" in outcome or "cancelled" in outcome:
             close(workflow_id, generation, outcome)
         kind = REBUILD if workflow_id.startswith(f"{REBUILD}:") else BUILD
-        JOBS_ENDED.labels(kind, next(iter(outcome))).inc()
+        ended = next(iter(outcome))
+        JOBS_ENDED.labels(kind, ended).inc()
+        log.info("the job ended: %s", ended)
         return ", ".join(outcome)
 
     @DBOS.workflow(name=REBUILD, max_recovery_attempts=MOST_RECOVERIES)

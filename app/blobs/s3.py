@@ -13,8 +13,11 @@ import hashlib
 import os
 import re
 from collections.abc import Iterator
+from configparser import ConfigParser
+from configparser import Error as ConfigParserError
 from contextlib import contextmanager
 from datetime import datetime, timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -156,7 +159,7 @@ class S3BlobStore:
         return self._opened
 
     def _open(self) -> S3Store:
-        config: S3Config = {"disable_bulk_delete": True}  # which not every server of the API has
+        config: S3Config = {"disable_bulk_delete": True, **_credentials()}  # which not every server of the API has
         if self._endpoint is not None:
             config["endpoint"] = self._endpoint
         return S3Store(
@@ -212,6 +215,32 @@ class S3BlobStore:
 
 def _key(sha256: str) -> str:
     return f"{sha256[:2]}/{sha256[2:4]}/{sha256}"
+
+
+def _credentials() -> "S3Config":
+    """The key in the file of AWS_SHARED_CREDENTIALS_FILE, where there is one: secrets come as files to containers.
+
+    Its section `default`, as other tools write it. Raises InvalidInput for what has no key.
+    """
+    file = os.environ.get("AWS_SHARED_CREDENTIALS_FILE")
+    if not file:
+        return {}
+    parser = ConfigParser(interpolation=None)
+    try:
+        parser.read_string(Path(file).read_text())
+        section = parser["default"]
+        found: S3Config = {
+            "access_key_id": section["aws_access_key_id"],
+            "secret_access_key": section["aws_secret_access_key"],
+        }
+    except (OSError, KeyError, ConfigParserError) as error:
+        raise InvalidInput(
+            f"AWS_SHARED_CREDENTIALS_FILE: {file} has no key of the section [default] "
+            f"(aws_access_key_id, aws_secret_access_key): {type(error).__name__}"
+        ) from error
+    if "aws_session_token" in section:
+        found["session_token"] = section["aws_session_token"]
+    return found
 
 
 def _endpoint() -> str | None:

@@ -7,7 +7,7 @@ asks is in `app.services.installation_metrics`.
 
 import platform
 
-from prometheus_client import Counter, Gauge, Histogram, Info
+from prometheus_client import Counter, Gauge, Histogram, Info, disable_created_metrics
 
 from app import __version__
 
@@ -41,6 +41,8 @@ __all__ = [
 _QUICK_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 _LONG_S = (0.1, 0.5, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3600.0, 14400.0)
 _SIZES = tuple(4.0**k * 1024 for k in range(9))  # 1 KiB to 64 MiB
+
+disable_created_metrics()  # type: ignore[no-untyped-call]  # a second series of each, of no use here
 
 Info("isodyn_build", "Which Isodyn runs.").info({"version": __version__, "python": platform.python_version()})
 

@@ -1,12 +1,12 @@
 """Which request asked for a job, and where in a trace that was.
 
-Revision: 0006, after 0005.
+Revision: 0008, after 0005.
 """
 
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0006_job_request"
+revision = "0008"
 down_revision = "0005"
 branch_labels = None
 depends_on = None
