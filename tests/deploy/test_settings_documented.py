@@ -34,7 +34,9 @@ def read_in_code() -> Iterator[str]:
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 yield from re.findall(r"^(?:ISODYN|AWS|OTEL)_[A-Z0-9_]+$", node.value)
             if isinstance(node, ast.Call) and "environ" in ast.unparse(node.func):
-                yield from (each.value for each in node.args if isinstance(each, ast.Constant))
+                yield from (
+                    each.value for each in node.args if isinstance(each, ast.Constant) and isinstance(each.value, str)
+                )
 
 
 @pytest.mark.parametrize("name", sorted(FIELDS))
