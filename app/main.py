@@ -126,7 +126,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     context = open_context(settings)
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-                  redirect_slashes=False)  # fmt: skip
+                  redirect_slashes=False,
+                  # AccessLog makes the span of a request: FastAPI's would tell queries and clients' addresses.
+                  telemetry={"tracing": False, "metrics": False, "logs": False})  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
     for part in (

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import typer
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 
 from app.errors import IsodynError
 from app.settings import Settings
@@ -37,4 +38,4 @@ def say_refusals() -> Iterator[None]:
 
 
 def _complain(sentence: str) -> None:
-    Console(stderr=True, highlight=False).print(f"[red]{sentence}[/red]", soft_wrap=True)
+    Console(stderr=True, highlight=False).print(f"[red]{escape(sentence)}[/red]", soft_wrap=True)
