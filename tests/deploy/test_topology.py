@@ -26,8 +26,6 @@ TRACE = "ab" * 16
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.postgres,
-    pytest.mark.s3,
     pytest.mark.skipif(shutil.which("caddy") is None, reason="no caddy: apt-get install caddy"),
 ]
 
@@ -39,6 +37,7 @@ class Installation:
         self.folder = folder
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.clients: list[httpx.Client] = []
+        self.metrics_ports: list[int] = []
         self.site = f"localhost:{free_port()}"
         self.environment = {
             **os.environ,
@@ -66,7 +65,8 @@ class Installation:
         ports = [str(free_port()) for _ in range(2)]
         for k, port in enumerate(ports):
             self.isodyn(f"api-{k}", "serve", "--no-worker", "--port", port)
-            self.isodyn(f"worker-{k}", "worker")
+            self.metrics_ports.append(free_port())
+            self.isodyn(f"worker-{k}", "worker", ISODYN_WORKER_METRICS_PORT=str(self.metrics_ports[k]))
         caddyfile = self.folder / "Caddyfile"
         caddyfile.write_text(CADDYFILE.read_text().replace("admin off", "admin off\nauto_https disable_redirects"))
         self.run(
@@ -129,6 +129,8 @@ def installation(tmp_path: Path, postgres_url: str, s3: Server) -> Iterator[Inst
             made.kill(name)
 
 
+@pytest.mark.postgres
+@pytest.mark.s3
 def test_everything_works_through_the_proxy_and_outlives_a_web_process_and_a_worker(
     installation: Installation, hall_steps: Callable[..., list[dict[str, Any]]]
 ) -> None:
@@ -167,6 +169,27 @@ def test_everything_works_through_the_proxy_and_outlives_a_web_process_and_a_wor
     upload = http.post(f"/v1/floors/{floor}/surveys", content=walk(0.3))
     installation.kill("worker-0")
     installation.wait_for(upload.json()["job"])
+    told = httpx.get(f"http://127.0.0.1:{installation.metrics_ports[1]}/metrics").text
+    assert "isodyn_workers_taken_over_total 1.0" in told
+    assert 'isodyn_jobs_ended_total{kind="rebuild",outcome="published"}' in told
+
+
+def test_a_stranger_who_says_he_is_a_proxy_is_not_believed(tmp_path: Path) -> None:
+    alone, port = Installation(tmp_path, f"sqlite:///{tmp_path / 'isodyn.db'}"), free_port()
+    alone.environment["ISODYN_BLOB_URL"] = f"file://{tmp_path / 'blobs'}"
+    address = f"http://127.0.0.1:{port}"
+    try:
+        alone.isodyn(
+            "api", "serve", "--no-worker", "--port", str(port), ISODYN_TRUSTED_PROXIES="192.0.2.1,2001:db8::/32"
+        )
+        patiently(lambda: httpx.get(f"{address}/readyz").status_code == 200)
+        answer = httpx.post(
+            f"{address}/view/session", data={"key": KEY}, headers={"Origin": address, "X-Forwarded-Proto": "https"}
+        )
+        assert answer.status_code == 303, answer.text
+        assert "Secure" not in answer.headers["set-cookie"]
+    finally:
+        alone.kill("api")
 
 
 def walk(offset_m: float) -> bytes:
