@@ -59,7 +59,8 @@ _log = logging.getLogger(__name__)
 
 DESCRIPTION = """Magnetic maps of buildings: upload walks, get a field map per floor, locate a window of
 magnetometer samples. Lengths are metres, field microtesla, angles radians, times UTC; every estimate says how sure it
-is. Errors are RFC 9457 problem documents."""
+is. Errors are RFC 9457 problem documents. Every answer names its request in
+`X-Request-ID`: yours, or one made for it."""
 
 
 MOST_SEARCHES = 4  # at once: a search holds Python's one lock part of its time, so that more only wait for each other
