@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install install-dev demo serve test test-slow campaign fuzz lint format benchmarks evaluate evaluate-tracks gallery openapi lock clean
+.PHONY: help install install-dev demo serve test test-slow campaign fuzz lint format benchmarks evaluate evaluate-tracks gallery openapi lock sbom clean
 
 help: ## Explain every target
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -76,6 +76,11 @@ lock: install-dev ## Resolve the dependencies anew
 	$(BIN)/python -m pip install --quiet pip-tools
 	$(BIN)/pip-compile --quiet --upgrade --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-annotate --no-header -o requirements.lock pyproject.toml
 	$(BIN)/pip-compile --quiet --upgrade --extra dev --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-annotate --no-header -o requirements-dev.lock pyproject.toml
+	$(BIN)/pip-compile --quiet --upgrade --extra otel --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-annotate --no-header -o requirements-otel.lock pyproject.toml
+
+sbom: install-dev ## Write what is shipped, as CycloneDX, to build/isodyn.cdx.json
+	@mkdir -p build
+	$(BIN)/cyclonedx-py requirements requirements-otel.lock --pyproject pyproject.toml --output-reproducible --output-file build/isodyn.cdx.json
 
 clean: ## Remove the environment and caches (never your data in var/)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -5,7 +5,6 @@ import gc
 import logging
 import os
 from collections.abc import AsyncIterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from threading import Thread
 
@@ -26,6 +25,7 @@ from app.api import (
     localizability,
     locate,
     maps,
+    metrics,
     outlines,
     plans,
     reference_field,
@@ -34,9 +34,9 @@ from app.api import (
     track_stream,
     tracks,
 )
+from app.api.access_log import AccessLog
 from app.api.body import BodyLimit
 from app.api.context import Context
-from app.api.metrics import Metrics, MetricsMiddleware
 from app.api.problems import Problem, add_problem_handlers
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
@@ -49,6 +49,7 @@ from app.services.manage_keys import KeyRing, ensure_admin_key
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
 from app.settings import Settings
+from app.telemetry.facts import ContextExecutor
 from app.viewer.database_source import DatabaseViewerSource
 from app.viewer.page import ViewerApp
 
@@ -58,7 +59,8 @@ _log = logging.getLogger(__name__)
 
 DESCRIPTION = """Magnetic maps of buildings: upload walks, get a field map per floor, locate a window of
 magnetometer samples. Lengths are metres, field microtesla, angles radians, times UTC; every estimate says how sure it
-is. Errors are RFC 9457 problem documents."""
+is. Errors are RFC 9457 problem documents. Every answer names its request in
+`X-Request-ID`: yours, or one made for it."""
 
 
 MOST_SEARCHES = 4  # at once: a search holds Python's one lock part of its time, so that more only wait for each other
@@ -84,7 +86,7 @@ def open_context(settings: Settings) -> Context:
     blobs = open_blob_store(settings.resolved_blob_url)
     sessions = session_factory(engine)
     grids = GridCache(blobs, settings.grid_cache_bytes)
-    follows = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
+    follows = ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
     return Context(
         settings=settings,
         engine=engine,
@@ -92,9 +94,8 @@ def open_context(settings: Settings) -> Context:
         blobs=blobs,
         queue=JobQueue(engine),
         grids=grids,
-        metrics=Metrics(),
         keys=KeyRing(sessions),
-        searches=ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
+        searches=ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
         follows=follows,
         follower=Follower(
             engine,
@@ -126,7 +127,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     context = open_context(settings)
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-                  redirect_slashes=False)  # fmt: skip
+                  redirect_slashes=False,
+                  # AccessLog makes the span of a request: FastAPI's would tell queries and clients' addresses.
+                  telemetry={"tracing": False, "metrics": False, "logs": False})  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
     for part in (
@@ -134,6 +137,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         tracks,
         track_stream,
         health,
+        metrics,
         buildings,
         floors,
         outlines,
@@ -154,7 +158,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.mount("/view", viewer)
     add_problem_handlers(app)
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, streams_itself=_is_upload)
-    app.add_middleware(MetricsMiddleware, metrics=context.metrics)
+    app.add_middleware(AccessLog)
     _describe_problems(app)
     return app
 

@@ -1,6 +1,7 @@
 """Settings, read once at the edge from `ISODYN_*` and passed on as values."""
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -8,10 +9,16 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 __all__ = ["Settings"]
 
 
+SECRETS_DIR = Path("/run/secrets")
+"""Where containers find their secrets: what no variable tells may lie here, in a file of its name."""
+
+
 class Settings(BaseSettings):
     """Every environment variable Isodyn reads."""
 
-    model_config = SettingsConfigDict(env_prefix="ISODYN_", extra="ignore")
+    model_config = SettingsConfigDict(
+        env_prefix="ISODYN_", extra="ignore", secrets_dir=SECRETS_DIR if SECRETS_DIR.is_dir() else None
+    )
 
     data_dir: Path = Field(default=Path("./var"), description="folder of the database and the blobs")
     database_url: str | None = Field(
@@ -38,6 +45,17 @@ class Settings(BaseSettings):
     )
     track_cache_bytes: int = Field(default=512 * 2**20, description="memory for the states of tracks in use")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
+    trusted_proxies: str = Field(
+        default="127.0.0.1,::1",
+        description="addresses and networks, with commas, of proxies whose X-Forwarded-For and -Proto are believed",
+    )
+    log_format: Literal["text", "json"] = Field(default="text", description="a line for people, or JSON for machines")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="the least of lines")
+    metrics_key: str | None = Field(default=None, description="a key that may read /metrics and nothing else")
+    worker_metrics_port: int | None = Field(
+        default=None, ge=1, le=65535, description="port where a worker shows its metrics, on ISODYN_HOST, to anybody"
+    )
+    otel: bool = Field(default=False, description="send traces by OpenTelemetry; needs the extra `otel`")
 
     @property
     def resolved_database_url(self) -> str:

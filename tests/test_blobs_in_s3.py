@@ -322,3 +322,15 @@ def test_what_is_no_endpoint_is_refused(monkeypatch: pytest.MonkeyPatch, endpoin
     with pytest.raises(InvalidInput, match="AWS_ENDPOINT_URL") as caught:
         open_blob_store("s3://bucket")
     assert "hunter2" not in str(caught.value)
+
+
+def test_the_key_may_lie_in_a_file(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+    file = tmp_path / "credentials"
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(file))
+    with pytest.raises(InvalidInput, match="AWS_SHARED_CREDENTIALS_FILE"):
+        open_blob_store(address).put(b"magnetite")
+    file.write_text("[default]\naws_access_key_id = testing\naws_secret_access_key = hunter2%\n")
+    store = open_blob_store(address)
+    assert store.get(store.put(b"magnetite")) == b"magnetite"

@@ -1,7 +1,6 @@
 """`python -m workers`: one worker, with the settings of the environment."""
 
 import argparse
-import logging
 import os
 
 PARENT_PID = os.getppid()  # before anything slow is imported: the parent may die meanwhile
@@ -18,12 +17,16 @@ def main() -> None:
         help="end when the process that started this, PID if given, ends",
     )
     arguments = parser.parse_args()
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
 
     from app.settings import Settings
+    from app.telemetry.logs import configure_logs
+    from app.telemetry.tracing import configure_tracing
     from workers.main import run_worker
 
-    run_worker(Settings(), parent_pid=arguments.exit_with_parent)
+    settings = Settings()
+    configure_logs(settings.log_format, settings.log_level)
+    configure_tracing(settings.otel, "isodyn-worker")
+    run_worker(settings, parent_pid=arguments.exit_with_parent)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,13 @@ import time
 from collections.abc import Callable, Iterator
 from typing import IO, Any
 
+from opentelemetry.context import attach
+
 from app.errors import IsodynError, JobCancelled, Unavailable
+from app.settings import Settings
+from app.telemetry.facts import add_facts, facts
+from app.telemetry.logs import configure_logs
+from app.telemetry.tracing import configure_tracing, flush_traces, traced_from, traceparent
 from workers.builder import Plan, Result, load_builder
 
 __all__ = ["FitFailed", "FitProcessDied", "run_fit"]
@@ -45,6 +51,7 @@ def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress, silence_s
     the child. A fit that makes no progress for `silence_s` counts as dead. Raises FitFailed, FitProcessDied, and
     Unavailable where the child could not reach its blobs.
     """
+    order = {"builder": builder, "plan": plan, "blob_url": blob_url, "facts": dict(facts()), "trace": traceparent()}
     child = subprocess.Popen(
         [sys.executable, "-m", "workers.fit_process"],
         stdin=subprocess.PIPE,
@@ -53,7 +60,7 @@ def run_fit(builder: str, plan: Plan, blob_url: str, report: Progress, silence_s
         start_new_session=True,  # a Ctrl-C is for the worker, which decides what becomes of its fits
     )
     try:
-        _tell(child, json.dumps({"builder": builder, "plan": plan, "blob_url": blob_url}))
+        _tell(child, json.dumps(order))
         return _listen(child, report, silence_s)
     finally:
         _stop(child)
@@ -145,6 +152,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as is a service manager's, sent to all at once
     os.nice(5)  # whoever asks for a position comes first
     order = json.loads(sys.stdin.readline())
+    _be_seen(order)
     cancelled = threading.Event()
     threading.Thread(target=_hear_parent, args=(cancelled,), daemon=True).start()
 
@@ -155,7 +163,17 @@ def main() -> None:
 
     answers.write(json.dumps(_answer(order, progress)) + "\n")
     answers.close()
+    flush_traces()
     os._exit(0)  # the thread that listens would be in the way of an orderly end
+
+
+def _be_seen(order: dict[str, Any]) -> None:
+    """What this process logs and traces belongs to the job that it works for."""
+    settings = Settings()
+    configure_logs(settings.log_format, settings.log_level)
+    configure_tracing(settings.otel, "isodyn-fit")
+    add_facts(**order.get("facts", {}))
+    attach(traced_from(order.get("trace")))
 
 
 def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:

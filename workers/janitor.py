@@ -12,6 +12,8 @@ from dbos import DBOS
 from sqlalchemy import make_url
 
 from app.jobs.engine import engine_configuration
+from app.settings import Settings
+from app.telemetry.logs import configure_logs
 
 __all__ = ["hand_over"]
 
@@ -32,6 +34,8 @@ def hand_over(database_url: str, dead_id: str) -> None:
 
 
 def main() -> None:
+    settings = Settings()
+    configure_logs(settings.log_format, settings.log_level)
     order = json.loads(sys.stdin.read())
     DBOS(config=engine_configuration(make_url(order["database_url"]), order["dead_id"]))
     DBOS.listen_queues([])

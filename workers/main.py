@@ -15,6 +15,7 @@ from math import ceil
 from types import FrameType
 
 from dbos import DBOS, DBOSClient
+from prometheus_client import start_http_server
 from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -51,6 +52,8 @@ def run_worker(
     time when `parent_pid` is given and is not this process's parent any more.
     """
     stop = _stop_on_signals()
+    if settings.worker_metrics_port is not None:
+        start_http_server(settings.worker_metrics_port, settings.host)
     url = settings.resolved_database_url
     migrate(url)
     engine = create_database_engine(url)

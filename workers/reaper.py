@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from dbos import DBOSClient
 
 from app.jobs.lease import Lease
+from app.telemetry.metrics import WORKERS_TAKEN_OVER
 from workers.janitor import hand_over
 from workers.lifeline import Lifeline
 from workers.reconcile import close_abandoned_jobs, has_unfinished_jobs
@@ -43,6 +44,7 @@ class Reaper:
     def _bury_the_dead(self) -> None:
         cut = self.lifeline.cut()
         for dead_id in self.lease.take_over_from_dead(cut):
+            WORKERS_TAKEN_OVER.inc()
             if has_unfinished_jobs(self.client, dead_id):
                 log.warning("worker %s died; its jobs go back to their queue", dead_id)
                 hand_over(self.database_url, dead_id)

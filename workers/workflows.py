@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from dbos import DBOS
 from dbos import error as dbos_error
+from opentelemetry import trace
 from sqlalchemy import select
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
@@ -22,6 +23,9 @@ from app.db.tables import BUILD, REBUILD, Job
 from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, claim_generation, lock_floor
+from app.telemetry.facts import add_facts, with_facts
+from app.telemetry.metrics import JOB_STEP_SECONDS, JOBS_ENDED
+from app.telemetry.tracing import link_to
 from workers.builder import Builder, Plan, Result
 from workers.fit_process import FitFailed, FitProcessDied, run_fit
 
@@ -37,6 +41,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 log = logging.getLogger(__name__)
+_tracer = trace.get_tracer("isodyn")
 
 
 @dataclass(frozen=True)
@@ -70,15 +75,23 @@ def register_workflows(context: WorkflowContext) -> None:
             outcome = {"failed": _describe(error)}
         if "failed" in outcome or "cancelled" in outcome:
             close(workflow_id, generation, outcome)
+        kind = REBUILD if workflow_id.startswith(f"{REBUILD}:") else BUILD
+        ended = next(iter(outcome))
+        JOBS_ENDED.labels(kind, ended).inc()
+        log.info("the job ended: %s", ended)
         return ", ".join(outcome)
 
     @DBOS.workflow(name=REBUILD, max_recovery_attempts=MOST_RECOVERIES)
     def rebuild(floor_id: str, generation: int) -> str:
-        return run(f"{REBUILD}:{floor_id}:{generation}", generation)
+        workflow_id = f"{REBUILD}:{floor_id}:{generation}"
+        with with_facts(workflow_id=workflow_id):
+            return run(workflow_id, generation)
 
     @DBOS.workflow(name=BUILD, max_recovery_attempts=MOST_RECOVERIES)
     def build(map_id: str) -> str:
-        return run(f"{BUILD}:{map_id}", 0)
+        workflow_id = f"{BUILD}:{map_id}"
+        with with_facts(workflow_id=workflow_id):
+            return run(workflow_id, 0)
 
 
 class _Steps:
@@ -103,10 +116,11 @@ class _Steps:
 
     def fit(self, workflow_id: str, plan: Plan) -> Outcome:
         with self._context.sessions() as session:
-            job_id = session.scalar(select(Job.id).where(Job.workflow_id == workflow_id))
-        if job_id is None:
+            job = session.scalar(select(Job).where(Job.workflow_id == workflow_id))
+        if job is None:
             return {"cancelled": True}
-        reporter = JobReporter(self._context.sessions, job_id, still_owner=_stop_unless_owner)
+        _say_whose(job)
+        reporter = JobReporter(self._context.sessions, job.id, still_owner=_stop_unless_owner)
         try:
             return {"result": self._fit_once_blobs_are_reached(plan, reporter)}
         except JobCancelled:
@@ -153,7 +167,11 @@ class _Steps:
 
 def _step(method: Callable[P, R], attempts: int) -> Callable[P, R]:
     def step(*args: P.args, **kwargs: P.kwargs) -> R:  # the engine marks functions, and cannot mark methods
-        return method(*args, **kwargs)
+        with (
+            _tracer.start_as_current_span(f"job {method.__name__}"),
+            JOB_STEP_SECONDS.labels(method.__name__).time(),
+        ):
+            return method(*args, **kwargs)
 
     return DBOS.step(
         name=method.__name__,
@@ -174,9 +192,16 @@ def _locked_job(session: Session, workflow_id: str) -> Job:
     job = session.scalar(select(Job).where(Job.workflow_id == workflow_id))
     if job is None:
         raise NotFound(f"no job for {workflow_id}")
+    _say_whose(job)
     lock_floor(session, job.floor_id)
     session.refresh(job)
     return job
+
+
+def _say_whose(job: Job) -> None:
+    """Log lines and the span from here on are of this job, and of the request that asked for it."""
+    add_facts(job_id=job.id, workflow_id=job.workflow_id, floor_id=job.floor_id, request_id=job.request_id)
+    link_to(job.traceparent)
 
 
 def _describe(error: Exception) -> str:

@@ -10,6 +10,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from app.api.context import Context, context_of
 from app.api.problems import Forbidden, Unauthorised
 from app.services.manage_keys import Identity
+from app.telemetry.metrics import AUTH_FAILURES
 
 __all__ = [
     "AdminOnly",
@@ -21,20 +22,24 @@ __all__ = [
     "SurveyReading",
     "SurveyWriting",
     "MapWriting",
+    "bearer",
     "recognised",
 ]
 
-_bearer = HTTPBearer(auto_error=False, description="an API key, `isd_...`; `isodyn keys create` makes one")
+bearer = HTTPBearer(auto_error=False, description="an API key, `isd_...`; `isodyn keys create` makes one")
 
 
 async def recognised(context: Context, secret: str | None, *any_of: str) -> Identity:
     """Whose key this is. Raises Unauthorised, and Forbidden where it has none of the scopes that are asked for."""
     if secret is None:
+        AUTH_FAILURES.labels("missing").inc()
         raise Unauthorised("send your key as `Authorization: Bearer isd_...`")
     identity = context.keys.recent(secret) or await run_in_threadpool(context.keys.recognise, secret)
     if identity is None:
+        AUTH_FAILURES.labels("unknown").inc()
         raise Unauthorised("this key is not known or was revoked; `isodyn keys create` makes a new one")
     if any_of and not identity.may(*any_of):
+        AUTH_FAILURES.labels("forbidden").inc()
         raise Forbidden(f"this needs a key with scope {' or '.join(any_of)}")
     return identity
 
@@ -42,10 +47,12 @@ async def recognised(context: Context, secret: str | None, *any_of: str) -> Iden
 def _needs(*any_of: str) -> Callable[..., Awaitable[Identity]]:
     # One dependency that calls the rest: FastAPI spends more on each than the look-up of a known key takes.
     async def check(
-        request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+        request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
     ) -> Identity:
         secret = None if credentials is None else credentials.credentials
-        return await recognised(await context_of(request), secret, *any_of)
+        identity = await recognised(await context_of(request), secret, *any_of)
+        request.state.identity = identity
+        return identity
 
     return check
 

@@ -10,7 +10,6 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.api.metrics import Metrics
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
 from app.services.follow import Follower
@@ -36,7 +35,6 @@ class Context:
     blobs: BlobStore
     queue: JobQueue
     grids: GridCache
-    metrics: Metrics
     keys: KeyRing
     searches: Executor
     follows: Executor

@@ -4,14 +4,10 @@ from typing import Literal
 
 from fastapi import APIRouter, Response
 from fastapi.responses import JSONResponse
-from prometheus_client import generate_latest
-from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 from sqlalchemy import text
 
-from app.api.auth import AdminOnly
 from app.api.context import ContextDep
-from app.api.problems import ERROR_RESPONSES
 
 __all__ = ["router"]
 
@@ -49,15 +45,3 @@ def readyz(context: ContextDep) -> Response:
     ready = all(check == "ok" for check in checks.values())
     health = Health(status="ok" if ready else "unavailable", checks=checks)
     return JSONResponse(health.model_dump(), 200 if ready else 503)
-
-
-@router.get(
-    "/metrics",
-    summary="Prometheus metrics",
-    response_class=Response,
-    responses={**ERROR_RESPONSES, 200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
-)
-def metrics(context: ContextDep, _: AdminOnly) -> Response:
-    context.metrics.cached_bytes.set(context.grids.nbytes)
-    context.metrics.cached_maps.set(len(context.grids))
-    return Response(generate_latest(context.metrics.registry), media_type=CONTENT_TYPE_LATEST)

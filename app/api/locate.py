@@ -1,12 +1,13 @@
 """Where am I? A window of magnetometer samples in, a fix out. Nothing is written, nothing queued."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
+from opentelemetry import trace
 from pydantic import BaseModel
 from sqlalchemy import select
 
@@ -20,10 +21,19 @@ from app.db.tables import Building
 from app.errors import Fault, InvalidInput, InvalidWindow, NotFound
 from app.positioning.fix import Prior
 from app.services.calibrations import AppliedCalibration, find_calibration
-from app.services.locate_window import ActiveMap, active_maps, locate_window
+from app.services.locate_window import ActiveMap, LocateResult, active_maps, locate_window
+from app.telemetry.metrics import (
+    LOCATE_ESTIMATES,
+    LOCATE_FIXES,
+    LOCATE_FLOORS,
+    LOCATE_SEARCH_SECONDS,
+    LOCATE_SECONDS,
+    LOCATE_WAITING_SECONDS,
+)
 
 __all__ = ["router"]
 
+_tracer = trace.get_tracer("isodyn")
 router = APIRouter(prefix="/v1", tags=["locate"], responses=ERROR_RESPONSES)
 Explain = Annotated[
     bool, Query(description="also answer the likelihood over the floor, residuals, and the runner-up; takes longer")
@@ -111,19 +121,33 @@ def _calibration(context: Context, identity: Identity, body: LocateBody) -> Appl
 def _locate(
     context: Context, identity: Identity, maps: list[ActiveMap], body: LocateBody, start: float, explained: bool
 ) -> FixView:
+    LOCATE_WAITING_SECONDS.observe(perf_counter() - start)
     if len(body.window.b_ut) > context.settings.max_window_samples:
         limit = context.settings.max_window_samples
         raise InvalidWindow(f"the window has more than {limit} samples", Fault("/body/window/b_ut", "send fewer"))
     calibration = _calibration(context, identity, body)
-    result = locate_window(
-        maps,
-        context.grids,
-        core_window(body.window, None if calibration is None else calibration.model),
-        composition=body.composition,
-        techniques=body.techniques,
-        prior=Prior((*body.prior.position_m,), body.prior.sd_m) if body.prior else None,  # type: ignore[arg-type]
-        options=core_options(body, perf_counter),
-        explained=explained,
-    )
+    with _tracer.start_as_current_span("search"):
+        result = locate_window(
+            maps,
+            context.grids,
+            core_window(body.window, None if calibration is None else calibration.model),
+            composition=body.composition,
+            techniques=body.techniques,
+            prior=Prior((*body.prior.position_m,), body.prior.sd_m) if body.prior else None,  # type: ignore[arg-type]
+            options=core_options(body, perf_counter),
+            explained=explained,
+        )
     timing = Timing(search=result.search_ms, total=1e3 * (perf_counter() - start))
+    _count(result, body.techniques, timing)
     return show_fix(result.fix, body.techniques, list(result.map_ids), timing, result.explanation, calibration)
+
+
+def _count(result: LocateResult, techniques: Sequence[str], timing: Timing) -> None:
+    LOCATE_SECONDS.observe(1e-3 * timing.total)
+    LOCATE_SEARCH_SECONDS.observe(1e-3 * timing.search)
+    LOCATE_FLOORS.observe(len(result.map_ids))
+    LOCATE_FIXES.labels(result.fix.status).inc()
+    for technique in techniques:
+        found = getattr(result.fix, technique)
+        available = found is not None and getattr(found, "available", True)
+        LOCATE_ESTIMATES.labels(technique, str(available).lower()).inc()

@@ -1,51 +1,43 @@
-"""What `/metrics` shows of one web process."""
+"""`/metrics`: what this process has counted, and what it sees of the installation."""
 
-from time import perf_counter
+from hmac import compare_digest
+from typing import Annotated
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.security import HTTPAuthorizationCredentials
+from prometheus_client import REGISTRY, CollectorRegistry, generate_latest
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-__all__ = ["Metrics", "MetricsMiddleware"]
+from app.api.auth import bearer, recognised
+from app.api.context import ContextDep
+from app.api.problems import ERROR_RESPONSES
+from app.services.installation_metrics import InstallationMetrics
 
-_METHODS = frozenset({"GET", "POST", "PATCH", "DELETE", "PUT", "HEAD", "OPTIONS"})
+__all__ = ["router"]
 
-
-class Metrics:
-    """The counters of one web process."""
-
-    def __init__(self) -> None:
-        self.registry = CollectorRegistry()
-        labels = ("method", "route", "status")
-        self.requests = Counter("isodyn_http_requests", "Requests served", labels, registry=self.registry)
-        self.seconds = Histogram(
-            "isodyn_http_request_seconds", "Time to serve a request", ("method", "route"), registry=self.registry
-        )
-        self.cached_bytes = Gauge("isodyn_grid_cache_bytes", "Memory of maps held ready", registry=self.registry)
-        self.cached_maps = Gauge("isodyn_grid_cache_maps", "Maps held ready", registry=self.registry)
+router = APIRouter(tags=["operations"])
 
 
-class MetricsMiddleware:
-    """Count and time each request under its route's template, never under its path (ids would be labels)."""
+async def _may_read(
+    request: Request, context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
+) -> None:
+    """The key of ISODYN_METRICS_KEY, or an admin's."""
+    secret = None if credentials is None else credentials.credentials
+    wanted = context.settings.metrics_key
+    if secret is not None and wanted is not None and compare_digest(secret.encode(), wanted.encode()):
+        return
+    request.state.identity = await recognised(context, secret, "admin")
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self.app, self.metrics = app, metrics
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        status, start = 500, perf_counter()
-
-        async def watch(message: Message) -> None:
-            nonlocal status
-            if message["type"] == "http.response.start":
-                status = message["status"]
-            await send(message)
-
-        try:
-            await self.app(scope, receive, watch)
-        finally:
-            route = getattr(scope.get("route"), "path", "unmatched")
-            method = scope["method"] if scope["method"] in _METHODS else "other"
-            self.metrics.requests.labels(method, route, status).inc()
-            self.metrics.seconds.labels(method, route).observe(perf_counter() - start)
+@router.get(
+    "/metrics",
+    summary="Prometheus metrics",
+    response_class=Response,
+    responses={**ERROR_RESPONSES, 200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+    dependencies=[Depends(_may_read)],
+)
+def metrics(context: ContextDep) -> Response:
+    """In Prometheus' text format; nothing in it is of one organisation."""
+    seen = CollectorRegistry()
+    seen.register(InstallationMetrics(context.engine, context.settings.data_dir))
+    return Response(generate_latest(REGISTRY) + generate_latest(seen), media_type=CONTENT_TYPE_LATEST)

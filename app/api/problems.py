@@ -24,6 +24,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy.exc import DBAPIError, OperationalError
 from starlette.exceptions import HTTPException
 
+from app.api.access_log import REQUEST_ID_HEADER
 from app.errors import (
     Conflict,
     CorruptArtefact,
@@ -38,6 +39,8 @@ from app.errors import (
     Unavailable,
     UnreadableSurvey,
 )
+from app.telemetry.facts import request_id
+from app.telemetry.metrics import PROBLEMS
 
 __all__ = [
     "ERROR_RESPONSES",
@@ -95,6 +98,9 @@ class Problem(BaseModel):
     status: int
     detail: str
     errors: list[ProblemError] = Field(default_factory=list)
+    request_id: str | None = Field(
+        default=None, description="also in the header X-Request-ID, and in the server's log", examples=["5f0e8d6b4c21"]
+    )
 
 
 def _documented(description: str) -> dict[str, Any]:
@@ -120,12 +126,14 @@ def problem_response(
     status: int, kind: str, title: str, detail: str, faults: Sequence[Fault] = (), headers: dict[str, str] | None = None
 ) -> JSONResponse:
     """One problem document."""
+    PROBLEMS.labels(kind).inc()
     problem = Problem(
         type=TYPE_BASE + kind,
         title=title,
         status=status,
         detail=detail,
         errors=[ProblemError(location=fault.location, reason=fault.reason) for fault in faults],
+        request_id=request_id(),
     )
     return JSONResponse(problem.model_dump(), status, headers=headers, media_type="application/problem+json")
 
@@ -203,7 +211,8 @@ async def _database_refused(request: Request, error: Exception) -> JSONResponse:
     return problem_response(500, "internal", "Something went wrong here", "the database refused the statement")
 
 
-async def _unexpected(_: Request, error: Exception) -> JSONResponse:
+async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     """A fault of ours: it is raised on after the answer, and the server logs it with its traceback."""
     detail = f"an unexpected {type(error).__name__}; the server's log says more, please report it"
-    return problem_response(500, "internal", "Something went wrong here", detail)
+    headers = {REQUEST_ID_HEADER: request.state.request_id}  # this answer passes no middleware
+    return problem_response(500, "internal", "Something went wrong here", detail, headers=headers)

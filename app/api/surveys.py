@@ -22,7 +22,7 @@ from app.api.models import Finite, Id, Name, RequestModel, unchanged
 from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Building, Floor, Job, Map, Survey
-from app.errors import NotFound
+from app.errors import IsodynError, NotFound
 from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency, WalkLocalizability
 from app.geodesy import Anchor
 from app.jobs.queue import lock_floor
@@ -30,6 +30,7 @@ from app.services.artefacts import samples_from_bytes
 from app.services.calibrations import AppliedCalibration, find_calibration
 from app.services.disturbances import checked_stretches, union_s
 from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
+from app.telemetry.metrics import UPLOAD_BYTES, UPLOAD_PARSE_SECONDS, UPLOADS
 
 __all__ = ["SURVEY_FILES", "SurveyFormat", "SurveyView", "router"]
 
@@ -188,16 +189,20 @@ async def upload_survey(
     told = await run_in_threadpool(_told_of, context, identity, floor_id, replaces, calibration_id, device)
     data = await read_upload(request, context.settings.max_upload_bytes)
 
+    UPLOAD_BYTES.observe(len(data))
+
     def receive() -> Response:
-        parsed = parse_survey(
-            context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
-            session=session, calibration=told.calibration,
-            at=None if told.anchor is None else (told.anchor, datetime.now(UTC).date()),
-        )  # fmt: skip
+        with UPLOAD_PARSE_SECONDS.time(), UPLOADS.labels("refused").count_exceptions(IsodynError):
+            parsed = parse_survey(
+                context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
+                session=session, calibration=told.calibration,
+                at=None if told.anchor is None else (told.anchor, datetime.now(UTC).date()),
+            )  # fmt: skip
 
         def create(transaction: Session) -> tuple[int, BaseModel]:
             floor = find_own(transaction, identity, Floor, floor_id)
             survey, job, new = record_survey(transaction, context.queue, floor, parsed, replaces)
+            UPLOADS.labels("new" if new else "known").inc()
             view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
             return 202 if new else 200, view
 

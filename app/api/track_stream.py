@@ -58,7 +58,7 @@ async def stream(browser: WebSocket, track_id: str) -> None:
     secret = _secret(browser)
     try:
         _check_origin(browser)
-        identity = await recognised(context, secret, "locate")
+        identity = browser.state.identity = await recognised(context, secret, "locate")
         work = partial(_ready, context, identity, track_id)
         kind, ready = await asyncio.get_running_loop().run_in_executor(context.follows, work)
     except IsodynError as error:

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
+from app.blobs.observed import observed
 from app.blobs.store import StoredBlob, check_name, is_name
 from app.errors import CorruptArtefact, NotFound, Unavailable
 
@@ -40,6 +41,7 @@ class FolderBlobStore:
         with self._disk_at_hand():
             self._temporary.mkdir(parents=True, exist_ok=True)
 
+    @observed
     def put(self, data: bytes) -> str:
         sha256 = hashlib.sha256(data).hexdigest()
         target = self._path(sha256)
@@ -52,6 +54,7 @@ class FolderBlobStore:
                 _sync_folder(folder)
         return sha256
 
+    @observed
     def get(self, sha256: str) -> bytes:
         check_name(sha256)
         try:
@@ -67,6 +70,7 @@ class FolderBlobStore:
             )
         return data
 
+    @observed
     def exists(self, sha256: str) -> bool:
         check_name(sha256)
         if self._path(sha256).is_file():
@@ -74,11 +78,13 @@ class FolderBlobStore:
         self._look_for_folder()
         return False
 
+    @observed
     def discard(self, sha256: str) -> None:
         check_name(sha256)
         with self._disk_at_hand():
             self._path(sha256).unlink(missing_ok=True)
 
+    @observed
     def discard_older(self, sha256: str, before: datetime) -> bool:
         check_name(sha256)
         path = self._path(sha256)

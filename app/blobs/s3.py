@@ -13,14 +13,18 @@ import hashlib
 import os
 import re
 from collections.abc import Iterator
+from configparser import ConfigParser
+from configparser import Error as ConfigParserError
 from contextlib import contextmanager
 from datetime import datetime, timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
 from obstore.store import S3Store
 
+from app.blobs.observed import observed
 from app.blobs.store import StoredBlob, check_name
 from app.errors import CorruptArtefact, InvalidInput, NotFound, Unavailable
 
@@ -63,6 +67,7 @@ class S3BlobStore:
         self._endpoint = _endpoint()
         self._opened: S3Store | None = None
 
+    @observed
     def put(self, data: bytes) -> str:
         sha256 = hashlib.sha256(data).hexdigest()
         # Also where it is already: that costs no more than to read it, repairs damage, and makes it young again.
@@ -70,6 +75,7 @@ class S3BlobStore:
             self._client().put(_key(sha256), data, use_multipart=False)
         return sha256
 
+    @observed
     def get(self, sha256: str) -> bytes:
         check_name(sha256)
         try:
@@ -86,6 +92,7 @@ class S3BlobStore:
             )
         return data
 
+    @observed
     def exists(self, sha256: str) -> bool:
         check_name(sha256)
         client = self._client()
@@ -103,6 +110,7 @@ class S3BlobStore:
             return False
         return True
 
+    @observed
     def discard(self, sha256: str) -> None:
         check_name(sha256)
         try:
@@ -111,6 +119,7 @@ class S3BlobStore:
         except FileNotFoundError:  # some servers mind, S3 does not
             return
 
+    @observed
     def discard_older(self, sha256: str, before: datetime) -> bool:
         """As the contract has it, but for a put between looking and deleting, some milliseconds: S3 deletes without
         conditions (docs/storage.md)."""
@@ -150,7 +159,7 @@ class S3BlobStore:
         return self._opened
 
     def _open(self) -> S3Store:
-        config: S3Config = {"disable_bulk_delete": True}  # which not every server of the API has
+        config: S3Config = {"disable_bulk_delete": True, **_credentials()}  # which not every server of the API has
         if self._endpoint is not None:
             config["endpoint"] = self._endpoint
         return S3Store(
@@ -206,6 +215,32 @@ class S3BlobStore:
 
 def _key(sha256: str) -> str:
     return f"{sha256[:2]}/{sha256[2:4]}/{sha256}"
+
+
+def _credentials() -> "S3Config":
+    """The key in the file of AWS_SHARED_CREDENTIALS_FILE, where there is one: secrets come as files to containers.
+
+    Its section `default`, as other tools write it. Raises InvalidInput for what has no key.
+    """
+    file = os.environ.get("AWS_SHARED_CREDENTIALS_FILE")
+    if not file:
+        return {}
+    parser = ConfigParser(interpolation=None)
+    try:
+        parser.read_string(Path(file).read_text())
+        section = parser["default"]
+        found: S3Config = {
+            "access_key_id": section["aws_access_key_id"],
+            "secret_access_key": section["aws_secret_access_key"],
+        }
+    except (OSError, KeyError, ConfigParserError) as error:
+        raise InvalidInput(
+            f"AWS_SHARED_CREDENTIALS_FILE: {file} has no key of the section [default] "
+            f"(aws_access_key_id, aws_secret_access_key): {type(error).__name__}"
+        ) from error
+    if "aws_session_token" in section:
+        found["session_token"] = section["aws_session_token"]
+    return found
 
 
 def _endpoint() -> str | None:

@@ -2,7 +2,7 @@
 
 import typer
 
-from app.cli import backup, calibrate, client, demo, doctor, evaluate, evaluate_tracks, keys, serve, view
+from app.cli import backup, calibrate, client, demo, doctor, evaluate, evaluate_tracks, keys, migrate, serve, view
 from app.cli.default_group import DEFAULT, DefaultGroup
 
 __all__ = ["main"]
@@ -16,6 +16,7 @@ main = typer.Typer(
 )
 main.command()(serve.serve)
 main.command()(serve.worker)
+main.command()(migrate.migrate)
 main.command()(demo.demo)
 main.command()(client.ingest)
 main.command()(calibrate.calibrate)

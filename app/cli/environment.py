@@ -6,17 +6,21 @@ from contextlib import contextmanager
 import typer
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 
 from app.errors import IsodynError
 from app.settings import Settings
+from app.telemetry.logs import configure_logs
 
 __all__ = ["read_settings", "say_refusals"]
 
 
 def read_settings() -> Settings:
-    """The settings of the environment; ends the command with one line per wrong variable."""
+    """The settings of the environment, and the log as they want it; or one line per wrong variable, and the end."""
     try:
-        return Settings()
+        settings = Settings()
+        configure_logs(settings.log_format, settings.log_level)
+        return settings
     except ValidationError as error:
         for fault in error.errors():
             _complain(f"ISODYN_{str(fault['loc'][0]).upper()}={fault['input']}: {fault['msg']}")
@@ -34,4 +38,4 @@ def say_refusals() -> Iterator[None]:
 
 
 def _complain(sentence: str) -> None:
-    Console(stderr=True, highlight=False).print(f"[red]{sentence}[/red]", soft_wrap=True)
+    Console(stderr=True, highlight=False).print(f"[red]{escape(sentence)}[/red]", soft_wrap=True)

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from app.cli.environment import read_settings, say_refusals
+from app.telemetry.tracing import configure_tracing
 
 __all__ = ["openapi", "serve", "worker"]
 
@@ -35,6 +36,7 @@ def serve(
     console = Console(stderr=True, highlight=False)
     _check_port(settings.host, settings.port)
     with say_refusals():
+        configure_tracing(settings.otel, "isodyn-api")
         made = first_start(settings)
         app = create_app(settings)
     if made is not None:
@@ -46,7 +48,8 @@ def serve(
         supervisor.start()
     try:
         console.print(f"Isodyn listens on http://{settings.host}:{settings.port} (page: /view/, contract: /docs)")
-        uvicorn.run(app, host=settings.host, port=settings.port, log_level="warning", access_log=False,
+        uvicorn.run(app, host=settings.host, port=settings.port, log_config=None, log_level="warning", access_log=False,
+                    proxy_headers=True, forwarded_allow_ips=settings.trusted_proxies,
                     timeout_graceful_shutdown=10, ws_max_size=2**20, ws_ping_timeout=60)  # fmt: skip
     finally:
         if supervisor is not None:
@@ -60,6 +63,7 @@ def worker() -> None:
     settings = read_settings()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     with say_refusals():
+        configure_tracing(settings.otel, "isodyn-worker")
         run_worker(settings)
 
 

@@ -17,6 +17,7 @@ from sqlalchemy.engine import URL
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.db.traced import trace_statements
 from app.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -41,18 +42,27 @@ MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory loc
 
 
 def create_database_engine(url: str) -> Engine:
-    """An engine for `sqlite:///file` or `postgresql+psycopg://`. Raises InvalidInput for any other address."""
+    """An engine for `sqlite:///file` or `postgresql+psycopg://`. Raises InvalidInput for any other address.
+
+    Its errors end up in the log, and quote statements without their values: these may say where somebody was.
+    """
     parsed = _checked(url)
     if parsed.get_backend_name() == "postgresql":
-        return create_engine(parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800)
+        engine = create_engine(
+            parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800, hide_parameters=True
+        )
+        trace_statements(engine)
+        return engine
     engine = create_engine(
         parsed,
         pool_size=10,
         max_overflow=30,
+        hide_parameters=True,
         connect_args={"timeout": BUSY_TIMEOUT_S, "isolation_level": "IMMEDIATE", "check_same_thread": False},
     )
     event.listen(engine, "connect", _prepare_sqlite_connection)
     event.listen(engine, "savepoint", _begin_before_savepoint)
+    trace_statements(engine)
     return engine
 
 

@@ -213,7 +213,8 @@ class Map(Base):
 class Job(Base):
     """What a user sees of background work. `workflow_id` names it in the engine: one row per workflow.
 
-    `status`: accepted, running, successful, failed, dismissed (OGC API Processes)."""
+    `status`: accepted, running, successful, failed, dismissed (OGC API Processes). `request_id` and `traceparent`
+    are of the request that asked for it first, for the log and for traces."""
 
     __tablename__ = "job"
     __table_args__ = (Index("ix_job_organisation_id_id", "organisation_id", "id"),)
@@ -231,6 +232,8 @@ class Job(Base):
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
     result: Mapped[dict[str, Any] | None]
+    request_id: Mapped[str | None] = mapped_column(String(64))
+    traceparent: Mapped[str | None] = mapped_column(String(55))
 
 
 class Track(Base):

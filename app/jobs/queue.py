@@ -14,6 +14,8 @@ from sqlalchemy.orm import Session
 from app.db.tables import BUILD, REBUILD, Floor, Job, Map
 from app.errors import NotFound
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
+from app.telemetry.facts import request_id
+from app.telemetry.tracing import traceparent
 
 __all__ = ["FINAL_STATES", "JobQueue", "claim_generation", "lock_floor"]
 
@@ -111,6 +113,7 @@ class JobQueue:
         self._client.destroy()
 
     def _enqueue(self, session: Session, job: Job, *arguments: str | int) -> Job:
+        job.request_id, job.traceparent = request_id(), traceparent()
         session.add(job)
         session.flush()
         options = EnqueueOptions(

@@ -25,6 +25,7 @@ from app.services.track_estimate import SEARCHING, Told, path_row, settled_row, 
 from app.services.track_log import Batch, TrackLog, Write, batches_of, end_idle, read_state
 from app.services.track_spec import StepKind, Trackers, step_kind
 from app.services.track_steps import core_step
+from app.telemetry.metrics import TRACK_BATCH_SECONDS, TRACK_STEPS
 from app.tracking.stored_state import state_from_bytes, state_nbytes, state_to_bytes
 from app.tracking.track import Followed, begin, follow
 from app.tracking.track_state import Tracker, TrackState
@@ -114,6 +115,15 @@ class Follower:
 
         Raises NotFound, Conflict (it has ended), InvalidInput (a fault in a step, nothing was followed).
         """
+        with TRACK_BATCH_SECONDS.time():
+            outcome = await self._follow_in_turn(track_id, organisation_id, steps, flush)
+        for name in ("accepted", "duplicates", "late"):
+            TRACK_STEPS.labels(name).inc(getattr(outcome, name))
+        return outcome
+
+    async def _follow_in_turn(
+        self, track_id: str, organisation_id: str, steps: Sequence[RawStep], flush: bool
+    ) -> Outcome:
         loop = asyncio.get_running_loop()
         turn = self._turns.setdefault(track_id, asyncio.Lock())
         async with turn:

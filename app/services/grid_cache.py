@@ -10,6 +10,12 @@ from app.field.grid import FieldGrid
 from app.geometry import Array
 from app.positioning.locate import SearchableFloor, prepare_floor, shared_noise_sd_uT
 from app.services.artefacts import grid_from_bytes
+from app.telemetry.metrics import (
+    MAP_CACHE_BYTES,
+    MAP_CACHE_EVICTIONS,
+    MAP_CACHE_LOAD_SECONDS,
+    MAP_CACHE_LOOKUPS,
+)
 
 __all__ = ["GridCache"]
 
@@ -58,14 +64,17 @@ class GridCache:
         """The entry under a key; several callers at once load it once, and share the error if that fails."""
         with self._lock:
             if key in self._entries:
+                MAP_CACHE_LOOKUPS.labels("hit").inc()
                 self._touch(key)
                 return self._entries[key]
             mine = key not in self._loading
             loading = self._loading.setdefault(key, Future())
+        MAP_CACHE_LOOKUPS.labels("miss").inc()
         if not mine:
             return loading.result()
         try:
-            entry = load()
+            with MAP_CACHE_LOAD_SECONDS.time():
+                entry = load()
         except BaseException as error:
             with self._lock:
                 del self._loading[key]
@@ -86,6 +95,8 @@ class GridCache:
         just_used = {key, _grid_key(key[1])}
         while self._bytes() > self._capacity_bytes and len(self._entries) > len(just_used):
             self._entries.popitem(last=False)
+            MAP_CACHE_EVICTIONS.inc()
+        MAP_CACHE_BYTES.set(self._bytes())
 
     def _touch(self, key: _Key) -> None:
         """A floor's grid counts as used after the floor, so that it is never dropped while a floor stands on it."""

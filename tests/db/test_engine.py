@@ -11,6 +11,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import Connection, Engine, inspect, select, text
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.engine import create_database_engine, downgrade, migrate, teach_old_sqlite
@@ -40,6 +41,14 @@ def test_no_table_but_ours_and_the_job_engines(engine: Engine) -> None:
     if engine.dialect.name == "postgresql":  # there the job engine has a schema of its own
         assert ours == OURS
         assert "workflow_status" in inspect(engine).get_table_names(schema="dbos")
+
+
+def test_an_error_does_not_quote_what_was_written(engine: Engine) -> None:
+    statement = text("INSERT INTO nowhere (position) VALUES (:position)")
+    with engine.connect() as connection, pytest.raises(DBAPIError) as caught:
+        connection.execute(statement, {"position": "12.345 m"})
+    assert "INSERT INTO nowhere" in str(caught.value)
+    assert "12.345" not in str(caught.value)
 
 
 def test_down_and_up_again(engine: Engine, database_url: str) -> None:
