@@ -21,6 +21,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.engine import QUEUE, engine_configuration, open_client
 from app.jobs.lease import Lease
+from app.jobs.queue import JobQueue
 from app.settings import Settings
 from workers.builder import DEFAULT_BUILDER, load_builder
 from workers.lifeline import Lifeline, new_worker_id
@@ -55,9 +56,11 @@ def run_worker(
     migrate(url)
     engine = create_database_engine(url)
     client = open_client(engine)
-    context = WorkflowContext(session_factory(engine), settings.resolved_blob_url, load_builder(builder), builder)
+    context = WorkflowContext(
+        session_factory(engine), JobQueue(engine), settings.resolved_blob_url, load_builder(builder), builder
+    )
     register_workflows(context)
-    lease = Lease(engine, new_worker_id(), lease_ttl_s)
+    lease = Lease(engine, new_worker_id(), lease_ttl_s, slots=settings.worker_processes)
     lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)

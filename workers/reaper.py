@@ -1,11 +1,14 @@
-"""Looks after the dead: hands their jobs over, and closes jobs that the engine gave up."""
+"""Looks after the dead and the forgotten: hands the jobs of dead workers over, closes jobs that the engine gave up, and
+admits those that nobody admitted."""
 
 import logging
 import threading
 from dataclasses import dataclass
 
 from dbos import DBOSClient
+from sqlalchemy import select
 
+from app.db.tables import Job
 from app.jobs.lease import Lease
 from workers.janitor import hand_over
 from workers.lifeline import Lifeline
@@ -35,6 +38,7 @@ class Reaper:
             try:
                 self._bury_the_dead()
                 close_abandoned_jobs(self.client, self.context)
+                self._admit_the_waiting()
             except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied
                 log.exception("could not look after dead workers; trying again")
             if stop.wait(min(self.lease.ttl_s / 4, LOOK_EVERY_S)):
@@ -49,3 +53,10 @@ class Reaper:
             self.lease.bury(dead_id)
         for dead_id in cut:
             self.lifeline.bury(dead_id)
+
+    def _admit_the_waiting(self) -> None:
+        """For the case that nobody adds or ends a job: workers start, and workers die."""
+        waiting = select(Job.id).where(Job.status == "accepted", Job.admitted_at.is_(None)).limit(1)
+        with self.context.sessions.begin() as session:
+            if session.scalar(waiting) is not None:
+                self.context.queue.admit(session)

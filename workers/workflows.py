@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session, sessionmaker
 from app.db.tables import BUILD, REBUILD, Job
 from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.progress import JobReporter
-from app.jobs.queue import FINAL_STATES, claim_generation, lock_floor
+from app.jobs.queue import FINAL_STATES, JobQueue, claim_generation, lock_floor
 from workers.builder import Builder, Plan, Result
 from workers.fit_process import FitFailed, FitProcessDied, run_fit
 
@@ -44,6 +44,7 @@ class WorkflowContext:
     """What the steps work with. `builder` is the module `builder_name`; the fit's child process imports it anew."""
 
     sessions: sessionmaker[Session]
+    queue: JobQueue
     blob_url: str
     builder: Builder
     builder_name: str
@@ -133,6 +134,7 @@ class _Steps:
             with self._context.sessions.begin() as session:
                 job = _locked_job(session, workflow_id)
                 self._context.builder.publish_build(session, job.id, plan, result)
+                self._context.queue.admit(session)
             return {"published": True}
         except IsodynError as error:
             return {"failed": str(error)}
@@ -147,6 +149,7 @@ class _Steps:
                     self._context.builder.dismiss_build(session, job.id)
                 else:
                     self._context.builder.fail_build(session, job.id, outcome["failed"])
+                self._context.queue.admit(session)
         except NotFound as error:
             log.info("%s: nothing to close: %s", workflow_id, error)
 

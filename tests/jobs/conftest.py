@@ -40,6 +40,11 @@ class Site:
         self.engine, self.sessions, self.queue = engine, sessions, queue
 
     def floor(self, **orders: object) -> Floor:
+        """One, of an organisation of its own."""
+        return self.floors(1, **orders)[0]
+
+    def floors(self, count: int, **orders: object) -> list[Floor]:
+        """Several, of one organisation of their own."""
         with self.sessions.begin() as session:
             organisation = Organisation(name=f"organisation {uuid4()}")
             session.add(organisation)
@@ -47,15 +52,18 @@ class Site:
             building = Building(organisation_id=organisation.id, name="b")
             session.add(building)
             session.flush()
-            floor = Floor(
-                organisation_id=organisation.id,
-                building_id=building.id,
-                name=json.dumps(orders),
-                ordinal=0,
-                elevation_m=0.0,
-            )
-            session.add(floor)
-        return floor
+            floors = [
+                Floor(
+                    organisation_id=organisation.id,
+                    building_id=building.id,
+                    name=json.dumps(orders),
+                    ordinal=0,
+                    elevation_m=0.0,
+                )
+                for _ in range(count)
+            ]
+            session.add_all(floors)
+        return floors
 
     def upload(self, floor: Floor) -> tuple[str, str]:
         """A survey row and its rebuild in one transaction: their ids."""
