@@ -39,6 +39,13 @@ class Settings(BaseSettings):
     track_cache_bytes: int = Field(default=512 * 2**20, description="memory for the states of tracks in use")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
 
+    job_history_days: float = Field(
+        default=7.0, ge=0, description="days that the job engine's own records of ended jobs stay"
+    )
+    track_history_days: float | None = Field(
+        default=None, ge=0, description="days that ended tracks stay; default: for ever"
+    )
+
     @property
     def resolved_database_url(self) -> str:
         return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'isodyn.db'}"

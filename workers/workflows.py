@@ -9,7 +9,7 @@ Whatever ends a step on purpose is in its outcome, because an exception comes ba
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
 from dbos import DBOS
@@ -23,7 +23,7 @@ from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, JobQueue, claim_generation, lock_floor
 from workers.builder import Builder, Plan, Result
-from workers.fit_process import FitFailed, FitProcessDied, run_fit
+from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
 
 __all__ = ["WorkflowContext", "register_workflows"]
 
@@ -48,6 +48,7 @@ class WorkflowContext:
     blob_url: str
     builder: Builder
     builder_name: str
+    fits: FitProcesses = field(default_factory=FitProcesses)
 
 
 def register_workflows(context: WorkflowContext) -> None:
@@ -119,14 +120,17 @@ class _Steps:
         """Raises Unavailable where the blob store stays away for the whole wait."""
         for wait_s in BLOB_WAITS_S:
             try:
-                return run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)
+                return self._run_fit(plan, reporter)
             except Unavailable as error:
                 log.warning("a fit waits %.0f s: %s", wait_s, error)
                 until = time.monotonic() + wait_s
             while time.monotonic() < until:
                 reporter.report(0.0, "waiting for the blob store")  # and may be cancelled meanwhile
                 time.sleep(0.25)
-        return run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)
+        return self._run_fit(plan, reporter)
+
+    def _run_fit(self, plan: Plan, reporter: JobReporter) -> Result:
+        return self._context.fits.run(self._context.builder_name, plan, self._context.blob_url, reporter.report)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)

@@ -42,8 +42,8 @@ BUSY_TIMEOUT_S = 30.0
 LOCK_TIMEOUT, STATEMENT_TIMEOUT = "2s", "30s"
 MIGRATION_PATIENCE_S = 300.0
 LOCKED_OUT = (
-    f"for {MIGRATION_PATIENCE_S:.0f} s other transactions held a table it changes. Nothing is lost: find them by "
-    "`SELECT pid, state, xact_start, query FROM pg_stat_activity ORDER BY xact_start`, end them, and start again"
+    f"for {MIGRATION_PATIENCE_S:.0f} s other transactions held a table it changes. Nothing is lost: end the long ones "
+    "(PostgreSQL's view pg_stat_activity has each with its xact_start and query), and start again"
 )
 HELD_UP = ("55P03", "57014", "40P01")  # PostgreSQL: lock not available, statement timeout, deadlock
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers

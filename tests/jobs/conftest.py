@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -130,11 +130,13 @@ class Crew:
     def command(**options: object) -> list[str]:
         return [sys.executable, "-c", START, json.dumps({"lease_ttl_s": 3.0, **options})]
 
-    def hire(self, data_dir: str = "var", **options: object) -> subprocess.Popen[bytes]:
-        """Start a worker. Workers with another data folder cannot see each other die, as on two machines."""
+    def hire(self, data_dir: str = "var", prefix: Sequence[str] = (), **options: object) -> subprocess.Popen[bytes]:
+        """Start a worker. Workers with another data folder cannot see each other die, as on two machines.
+
+        `prefix` goes before the command."""
         environment = {**self.environment, "ISODYN_DATA_DIR": str(self.folder / data_dir)}
         with self._log.open("a") as log:
-            process = subprocess.Popen(self.command(**options), env=environment, stderr=log)
+            process = subprocess.Popen([*prefix, *self.command(**options)], env=environment, stderr=log)
         self._processes.append(process)
         return process
 
