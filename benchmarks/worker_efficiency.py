@@ -64,7 +64,7 @@ def dismiss_build(session: Session, job_id: str) -> None:
 class Installation:
     """A database, workers, and jobs that spin."""
 
-    def __init__(self, url: str, folder: str) -> None:
+    def __init__(self, url: str, folder: str, code: str = START) -> None:
         migrate(url)
         self.engine = create_database_engine(url)
         self.sessions: sessionmaker[Session] = session_factory(self.engine)
@@ -72,10 +72,14 @@ class Installation:
         path = os.pathsep.join((str(Path(__file__).parent), str(Path(__file__).parents[1])))
         self._environment = {**os.environ, "ISODYN_DATABASE_URL": url, "ISODYN_DATA_DIR": folder, "PYTHONPATH": path}
         self.workers: list[subprocess.Popen[bytes]] = []
+        self._code = code
+
+    def start(self) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-c", self._code], env=self._environment)
 
     def hire(self, count: int) -> None:
         """Start workers, and wait until they live."""
-        self.workers = [subprocess.Popen([sys.executable, "-c", START], env=self._environment) for _ in range(count)]
+        self.workers = [self.start() for _ in range(count)]
         while len(self._live()) < count:
             time.sleep(0.1)
 
@@ -179,8 +183,8 @@ def main() -> None:
                 (run,) = installation.wait(installation.ask(1, 0.0))
                 waits.append((run["claimed_at"] - sent, run["began"] - sent))
             claimed_ms, begun_ms = ([1000 * each for each in column] for column in zip(*waits, strict=True))
-            print(f"request to claimed, idle workers   {median(claimed_ms):6.0f} ms median, {max(claimed_ms):.0f} worst; "
-                  f"to its fit {median(begun_ms):.0f}")  # fmt: skip
+            print(f"request to claimed, idle workers   {median(claimed_ms):6.0f} ms median, {max(claimed_ms):.0f} worst"
+                  f", to its fit {median(begun_ms):.0f}")  # fmt: skip
             time.sleep(3.0)
             before = [cpu_s(worker.pid) for worker in installation.workers]
             time.sleep(IDLE_S)

@@ -30,7 +30,7 @@ __all__ = ["WorkflowContext", "register_workflows"]
 FIT_ATTEMPTS = 3
 DATABASE_ATTEMPTS = 8  # a second, two, four ...: two minutes in all
 BLOB_WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # a store that cannot be reached: two minutes in all, too
-MOST_RECOVERIES = 10  # a job that takes its worker down with it must not do so for ever
+MOST_RECOVERIES = 5  # a job that takes its worker down with it must not do so for ever
 
 Outcome = dict[str, Any]
 P = ParamSpec("P")

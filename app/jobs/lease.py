@@ -68,7 +68,8 @@ class Lease:
     def take_over_from_dead(self, known_dead: Collection[str] = ()) -> list[str]:
         """Become the heir of every worker whose beat is too old or that is known to be dead, and return their ids.
 
-        An heir that dies too before it calls `bury` leaves a dead row whose beat grows old again.
+        An heir that dies too before it calls `bury` leaves a dead row whose beat grows old again. A beat of the future
+        is from before the clock was set back: whoever lives soon beats again.
         """
         dead = (
             update(Worker)
@@ -76,6 +77,7 @@ class Lease:
                 Worker.id != self.worker_id,
                 or_(
                     Worker.beat < self._clock(-self.ttl_s),
+                    Worker.beat > self._clock(self.ttl_s),
                     and_(Worker.state == "live", Worker.id.in_(known_dead)),
                 ),
             )

@@ -84,8 +84,13 @@ class Site:
         with self.sessions() as session:
             return session.get_one(Job, job_id)
 
-    def wait(self, job_id: str, until: Callable[[Job], bool] = lambda job: job.status in FINAL_STATES) -> Job:
-        deadline = time.monotonic() + PATIENCE_S
+    def wait(
+        self,
+        job_id: str,
+        until: Callable[[Job], bool] = lambda job: job.status in FINAL_STATES,
+        patience_s: float = PATIENCE_S,
+    ) -> Job:
+        deadline = time.monotonic() + patience_s
         while not until(job := self.job(job_id)):
             if time.monotonic() > deadline:
                 pytest.fail(f"job {job_id} is still {job.status} at {job.progress} %: {job.message}")
@@ -127,13 +132,13 @@ class Crew:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     @staticmethod
-    def command(**options: object) -> list[str]:
-        return [sys.executable, "-c", START, json.dumps({"lease_ttl_s": 3.0, **options})]
+    def command(code: str = START, **options: Any) -> list[str]:
+        return [sys.executable, "-c", code, json.dumps({"lease_ttl_s": 3.0, **options})]
 
-    def hire(self, data_dir: str = "var", prefix: Sequence[str] = (), **options: object) -> subprocess.Popen[bytes]:
+    def hire(self, data_dir: str = "var", prefix: Sequence[str] = (), **options: Any) -> subprocess.Popen[bytes]:
         """Start a worker. Workers with another data folder cannot see each other die, as on two machines.
 
-        `prefix` goes before the command."""
+        `prefix` goes before the command; `code` is what it runs, where that is not `run_worker`."""
         environment = {**self.environment, "ISODYN_DATA_DIR": str(self.folder / data_dir)}
         with self._log.open("a") as log:
             process = subprocess.Popen([*prefix, *self.command(**options)], env=environment, stderr=log)
