@@ -2,8 +2,8 @@
 
 Run: python benchmarks/worker_efficiency.py [DATABASE_URL] [--workers 4] [--jobs 60] [--cost 0.5]. Default: SQLite in a
 temporary folder. A job spins `cost` seconds of CPU in its fit's process. This file is also the builder that the workers
-load. Overhead of a job, where there are as many workers as cores: slots x wall / jobs - cost, so everything between
-two fits of a slot.
+load. Cores busy is of the time that others on the machine left. Overhead of a job, where there are as many workers as
+cores, is the time from the end of a slot's fit to the start of its next.
 """
 
 import argparse
@@ -13,7 +13,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -44,7 +46,7 @@ def fit_build(plan: dict[str, Any], _blobs: object, _progress: object) -> dict[s
     began, cpu_s = time.time(), time.process_time()
     while time.process_time() - cpu_s < plan["cost_s"]:
         sum(range(1000))
-    return {"claimed_at": plan["claimed_at"], "began": began, "ended": time.time()}
+    return {"claimed_at": plan["claimed_at"], "began": began, "ended": time.time(), "pid": os.getpid()}
 
 
 def publish_build(session: Session, job_id: str, _plan: dict[str, Any], result: dict[str, Any]) -> None:
@@ -129,16 +131,32 @@ class Installation:
         self.engine.dispose()
 
 
-def busy_s() -> float:
-    """CPU seconds that all cores of the machine have worked so far, whoever they worked for."""
-    fields = [int(each) for each in Path("/proc/stat").read_text().splitlines()[0].split()[1:]]
-    return (sum(fields[:8]) - fields[3] - fields[4]) / TICKS
+def machine_s() -> tuple[float, float]:
+    """Seconds that all cores worked so far, whoever for, and that they were idle."""
+    fields = [int(each) for each in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+    idle = fields[3] + fields[4]
+    return (sum(fields) - idle) / TICKS, idle / TICKS
 
 
-def cpu_s(pid: int) -> float:
-    """CPU seconds of a process without its children."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
+def cpu_s(pids: list[int], children: bool = True) -> float:
+    """CPU seconds of processes, and of their children, those that have ended too."""
+    total = 0
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+            if int(folder.name) in pids:
+                total += sum(int(each) for each in fields[11 : 15 if children else 13])
+            elif children and int(fields[1]) in pids:
+                total += int(fields[11]) + int(fields[12])
+    return total / TICKS
+
+
+def gaps_s(runs: list[dict[str, float]]) -> list[float]:
+    """Seconds from the end of a fit to the start of the next in the same process."""
+    of_process: dict[float, list[dict[str, float]]] = {}
+    for run in sorted(runs, key=lambda run: run["began"]):
+        of_process.setdefault(run["pid"], []).append(run)
+    return [after["began"] - before["ended"] for each in of_process.values() for before, after in pairwise(each)]
 
 
 def main() -> None:
@@ -154,27 +172,28 @@ def main() -> None:
         try:
             installation.hire(asked.workers)
             installation.wait(installation.ask(2 * asked.workers, 0.0))  # every worker has a warm child
-            began, busy = time.time(), busy_s()
-            runs = installation.wait(installation.ask(asked.jobs, asked.cost))
-            last = max(run["ended"] for run in runs)
-            first = min(run["began"] for run in runs)
-            wall_s = last - first
-            share = (busy_s() - busy) / (cores * (time.time() - began))
-            worked = asked.jobs * asked.cost / (cores * wall_s)
-            print(f"{asked.workers} workers, {cores} cores, {asked.jobs} jobs of {asked.cost:.2f} s CPU each: "
-                  f"{wall_s:.1f} s")  # fmt: skip
-            print(
-                f"cores busy with fits               {100 * worked:6.1f} % (all that ran on them: {100 * share:.0f} %)"
+            pids = [worker.pid for worker in installation.workers]
+            before = (*machine_s(), cpu_s(pids), time.time())
+            installation.wait(installation.ask(asked.jobs, asked.cost))
+            all_s, idle_s, ours_s, wall_s = (
+                now - was for now, was in zip((*machine_s(), cpu_s(pids), time.time()), before, strict=True)
             )
+            left_s = all_s + idle_s - (all_s - ours_s)
+            worked = asked.jobs * asked.cost / left_s
+            print(f"{asked.workers} workers, {cores} cores, {asked.jobs} jobs of {asked.cost:.2f} s CPU each: "
+                  f"{wall_s:.1f} s; others took {100 * (1 - left_s / (all_s + idle_s)):.0f} %")  # fmt: skip
+            print(f"of the rest: fits {100 * worked:.1f} %, workers {100 * (ours_s / left_s - worked):.1f} %, "
+                  f"idle {100 * idle_s / left_s:.1f} %")  # fmt: skip
+            print(f"CPU beside each fit                {1000 * (ours_s / asked.jobs - asked.cost):6.0f} ms")
             installation.dismiss()
 
             installation.hire(cores)
-            installation.wait(installation.ask(2 * cores, 0.0))
-            runs = installation.wait(installation.ask(asked.jobs, asked.cost))
-            wall_s = max(run["ended"] for run in runs) - min(run["began"] for run in runs)
-            spun_s = median(run["ended"] - run["began"] for run in runs)
-            overhead_s = cores * wall_s / asked.jobs - spun_s
-            print(f"{cores} workers: a job adds                {1000 * overhead_s:6.0f} ms to its {spun_s:.2f} s")
+            installation.wait(installation.ask(4 * cores, 0.0))
+            time.sleep(6.0)
+            gaps = sorted(gaps_s(installation.wait(installation.ask(asked.jobs, asked.cost))))
+            overhead_s = sum(gaps) / len(gaps)
+            print(f"{cores} workers, between two fits         {1000 * overhead_s:6.0f} ms mean, "
+                  f"{1000 * median(gaps):.0f} median, {1000 * gaps[-1]:.0f} worst")  # fmt: skip
 
             waits = []
             for _ in range(20):

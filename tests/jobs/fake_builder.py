@@ -1,8 +1,8 @@
 """A builder without mathematics for the worker's tests: sleeps in slices, and writes a diary beside the blobs.
 
 What a fit does is said by the map's spec or, for rebuilds, by the floor's name: a JSON object with `sleep_s`, `fail`,
-`die_times`, `silent`; `hold_s` keeps the fit's interpreter busy and lets no other thread in, `kill_worker` takes the
-worker down with the fit.
+`die_times`, `silent`; `claim_s` holds the floor locked that long, `hold_s` keeps the fit's interpreter busy and lets no
+other thread in, `kill_worker` takes the worker down with the fit.
 """
 
 import json
@@ -53,6 +53,9 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
     job.status = row.status = "running"
     job.started_at = datetime.now(UTC)
     orders = {**json.loads(floor.name), **row.spec}
+    if "claim_s" in orders:
+        note("claim starts", floor_id=floor.id)
+        time.sleep(orders["claim_s"])
     if orders.get("fail_claim"):
         raise InvalidInput("there is nothing to build; upload a survey")
     return {"map_id": row.id, "floor_id": floor.id, "sequence": row.sequence, "surveys": row.survey_ids, **orders}

@@ -96,6 +96,23 @@ def take_over(crew: "Crew", site: "Site", hosts: Network, way: Callable[..., Non
     return took_s
 
 
+@pytest.mark.slow
+def test_locks_of_a_host_that_is_cut_off_in_the_middle_of_a_transaction_are_let_go(
+    crew: "Crew", site: "Site", hosts: Network
+) -> None:
+    floor = site.floor(claim_s=5.0, sleep_s=0.5)
+    first = crew.hire("on a", prefix=hosts.on("a"), lease_ttl_s=30.0)
+    _, job_id = site.upload(floor)
+    site.wait(job_id, lambda _: bool(crew.diary(event="claim starts", floor_id=floor.id)))
+    crew.hire("on b", prefix=hosts.on("b"), lease_ttl_s=30.0)
+    hosts.cut("a")
+    began = time.monotonic()
+    assert site.wait(job_id, patience_s=2 * MOST_S).status == "successful"
+    print(f"cut off with locks: finished {time.monotonic() - began:.1f} s after")
+    assert time.monotonic() - began < MOST_S
+    assert first.wait(MOST_S) == FENCED
+
+
 def test_a_host_that_is_cut_off_fences_itself_and_the_other_finishes(
     crew: "Crew", site: "Site", hosts: Network
 ) -> None:
