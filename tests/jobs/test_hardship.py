@@ -80,6 +80,7 @@ def test_a_job_that_kills_its_worker_every_time_is_given_up_and_others_are_done(
     assert len(crew.diary(event="fit starts", floor_id=job.floor_id)) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "orders"), [(BUSY, {"sleep_s": 6.0}), (START, {"hold_s": 6.0})], ids=["its own interpreter", "the fit's"]
 )
