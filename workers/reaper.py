@@ -19,7 +19,7 @@ from workers.workflows import WorkflowContext
 __all__ = ["IDLE_POLL_S", "Reaper"]
 
 LOOK_EVERY_S = 5.0
-IDLE_POLL_S, BUSY_POLL_S = 0.25, 0.05
+IDLE_POLL_S, BUSY_POLL_S = 0.25, 0.1
 
 log = logging.getLogger(__name__)
 

@@ -47,7 +47,9 @@ _BINARY = {"schema": {"type": "string", "format": "binary"}}
 class NewMap(RequestModel):
     """What to build; everything left out has a good default."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert"}]})
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert", "priority": "high"}]}
+    )
     engine: Literal["hilbert", "exact", "compromise"] = "hilbert"
     components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
     kernel: Annotated[
