@@ -57,6 +57,13 @@ class Settings(BaseSettings):
     )
     otel: bool = Field(default=False, description="send traces by OpenTelemetry; needs the extra `otel`")
 
+    job_history_days: float = Field(
+        default=7.0, ge=0, description="days that the job engine's own records of ended jobs stay"
+    )
+    track_history_days: float | None = Field(
+        default=None, ge=0, description="days that ended tracks stay; default: for ever"
+    )
+
     @property
     def resolved_database_url(self) -> str:
         return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'isodyn.db'}"

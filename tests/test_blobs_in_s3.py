@@ -25,7 +25,7 @@ from app.errors import CorruptArtefact, InvalidInput, NotFound, Unavailable
 from app.settings import Settings
 from tests.s3_server import BUCKET, Server, Way, free_port
 from tests.test_blobs import ABSENT, BlobStoreContract
-from workers.fit_process import run_fit
+from workers.fit_process import FitProcesses
 
 pytestmark = pytest.mark.s3
 ROOT = Path(__file__).parents[1]
@@ -251,7 +251,9 @@ def test_a_fit_s_process_has_a_client_of_its_own(address: str, tmp_path: Path, m
     store = open_blob_store(address)
     store.put(b"the parent's client is in use")
     plan = {"floor_id": "f", "map_id": "m", "surveys": ["one"], "sleep_s": 0.1}
-    result = run_fit("tests.jobs.fake_builder", plan, address, lambda fraction, message: None)
+    fits = FitProcesses()
+    result = fits.run("tests.jobs.fake_builder", plan, address, lambda fraction, message: None)
+    fits.close()
     assert re.search(r"[0-9a-f]{64}", str(result))
     assert len(list(store.stored())) == 2
 
@@ -263,7 +265,7 @@ def test_a_fit_without_its_blobs_is_worth_another_try(
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
     plan = {"floor_id": "f", "map_id": "m", "surveys": ["one"], "sleep_s": 0.1}
     with pytest.raises(Unavailable, match="cannot be reached"):
-        run_fit("tests.jobs.fake_builder", plan, address, lambda fraction, message: None)
+        FitProcesses().run("tests.jobs.fake_builder", plan, address, lambda fraction, message: None)
 
 
 def test_the_doctor_writes_and_reads_and_leaves_nothing(s3: Server, address: str, tmp_path: Path) -> None:

@@ -22,16 +22,17 @@ from sqlalchemy.exc import SQLAlchemyError
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.engine import QUEUE, engine_configuration, open_client
 from app.jobs.lease import Lease
+from app.jobs.queue import JobQueue
 from app.settings import Settings
 from workers.builder import DEFAULT_BUILDER, load_builder
 from workers.lifeline import Lifeline, new_worker_id
-from workers.reaper import Reaper
+from workers.reaper import IDLE_POLL_S, Reaper
 from workers.reconcile import has_unfinished_jobs
+from workers.upkeep import Upkeep
 from workers.workflows import WorkflowContext, register_workflows
 
 __all__ = ["run_worker"]
 
-POLL_S = 0.25
 FENCED = 3
 
 log = logging.getLogger(__name__)
@@ -58,16 +59,21 @@ def run_worker(
     migrate(url)
     engine = create_database_engine(url)
     client = open_client(engine)
-    context = WorkflowContext(session_factory(engine), settings.resolved_blob_url, load_builder(builder), builder)
+    context = WorkflowContext(
+        session_factory(engine), JobQueue(engine), settings.resolved_blob_url, load_builder(builder), builder
+    )
     register_workflows(context)
-    lease = Lease(engine, new_worker_id(), lease_ttl_s)
+    lease = Lease(engine, new_worker_id(), lease_ttl_s, slots=settings.worker_processes)
     lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)
     _launch(engine, lease.worker_id, settings.worker_processes)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
+    upkeep = Upkeep(client, context.sessions, settings.job_history_days, settings.track_history_days)
+    _start_thread("upkeep", upkeep.run, stop)
     parent_died = _wait(stop, parent_pid)
     _leave(lease, client, 0.0 if parent_died else drain_s)
+    context.fits.close()
     lifeline.release()
     engine.dispose()
 
@@ -92,7 +98,7 @@ def _launch(engine: Engine, worker_id: str, fits_at_one_time: int) -> None:
     DBOS.launch()
     # The queue's row is shared: of workers set differently, the one that started last decides for all.
     DBOS.register_queue(
-        QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=POLL_S
+        QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=IDLE_POLL_S
     )
 
 

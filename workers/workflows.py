@@ -9,7 +9,7 @@ Whatever ends a step on purpose is in its outcome, because an exception comes ba
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
 from dbos import DBOS
@@ -22,19 +22,19 @@ from sqlalchemy.orm import Session, sessionmaker
 from app.db.tables import BUILD, REBUILD, Job
 from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.progress import JobReporter
-from app.jobs.queue import FINAL_STATES, claim_generation, lock_floor
+from app.jobs.queue import FINAL_STATES, JobQueue, claim_generation, lock_floor
 from app.telemetry.facts import add_facts, with_facts
 from app.telemetry.metrics import JOB_STEP_SECONDS, JOBS_ENDED
 from app.telemetry.tracing import link_to
 from workers.builder import Builder, Plan, Result
-from workers.fit_process import FitFailed, FitProcessDied, run_fit
+from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
 
 __all__ = ["WorkflowContext", "register_workflows"]
 
 FIT_ATTEMPTS = 3
 DATABASE_ATTEMPTS = 8  # a second, two, four ...: two minutes in all
 BLOB_WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # a store that cannot be reached: two minutes in all, too
-MOST_RECOVERIES = 10  # a job that takes its worker down with it must not do so for ever
+MOST_RECOVERIES = 5  # a job that takes its worker down with it must not do so for ever
 
 Outcome = dict[str, Any]
 P = ParamSpec("P")
@@ -49,9 +49,11 @@ class WorkflowContext:
     """What the steps work with. `builder` is the module `builder_name`; the fit's child process imports it anew."""
 
     sessions: sessionmaker[Session]
+    queue: JobQueue
     blob_url: str
     builder: Builder
     builder_name: str
+    fits: FitProcesses = field(default_factory=FitProcesses)
 
 
 def register_workflows(context: WorkflowContext) -> None:
@@ -132,14 +134,17 @@ class _Steps:
         """Raises Unavailable where the blob store stays away for the whole wait."""
         for wait_s in BLOB_WAITS_S:
             try:
-                return run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)
+                return self._run_fit(plan, reporter)
             except Unavailable as error:
                 log.warning("a fit waits %.0f s: %s", wait_s, error)
                 until = time.monotonic() + wait_s
             while time.monotonic() < until:
                 reporter.report(0.0, "waiting for the blob store")  # and may be cancelled meanwhile
                 time.sleep(0.25)
-        return run_fit(self._context.builder_name, plan, self._context.blob_url, reporter.report)
+        return self._run_fit(plan, reporter)
+
+    def _run_fit(self, plan: Plan, reporter: JobReporter) -> Result:
+        return self._context.fits.run(self._context.builder_name, plan, self._context.blob_url, reporter.report)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)
@@ -147,6 +152,7 @@ class _Steps:
             with self._context.sessions.begin() as session:
                 job = _locked_job(session, workflow_id)
                 self._context.builder.publish_build(session, job.id, plan, result)
+                self._context.queue.admit(session)
             return {"published": True}
         except IsodynError as error:
             return {"failed": str(error)}
@@ -161,6 +167,7 @@ class _Steps:
                     self._context.builder.dismiss_build(session, job.id)
                 else:
                     self._context.builder.fail_build(session, job.id, outcome["failed"])
+                self._context.queue.admit(session)
         except NotFound as error:
             log.info("%s: nothing to close: %s", workflow_id, error)
 

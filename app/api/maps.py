@@ -30,6 +30,7 @@ from app.field.grid import FieldGrid
 from app.field.kernels import base_kernel, is_sum
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
 from app.field.spec import Kernel, MapSpec, Noise
+from app.jobs.admission import HIGH, LOW, NORMAL
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
 from app.services.exact_limit import TOO_MANY, outgrow_exact
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
@@ -39,13 +40,16 @@ __all__ = ["MapView", "ready_map", "router"]
 
 router = APIRouter(prefix="/v1", tags=["maps"], responses=ERROR_RESPONSES)
 MAX_FIELD_POINTS = 100_000
+PRIORITIES = {"low": LOW, "normal": NORMAL, "high": HIGH}
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
 class NewMap(RequestModel):
     """What to build; everything left out has a good default."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert"}]})
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{}, {"engine": "hilbert", "priority": "high"}]}
+    )
     engine: Literal["hilbert", "exact", "compromise"] = "hilbert"
     components: Annotated[Components | None, Field(description="default: the richest all surveys can give")] = None
     kernel: Annotated[
@@ -73,6 +77,10 @@ class NewMap(RequestModel):
         list[Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]], Field(min_length=1, max_length=10_000)
     ] | None = None  # fmt: skip
     activate: bool = True
+    priority: Annotated[
+        Literal["low", "normal", "high"],
+        Field(description="among the jobs of your organisation; rebuilds that follow from uploads are low"),
+    ] = "normal"
 
 
 class ScoreView(BaseModel):
@@ -219,13 +227,13 @@ def create_map(
             floor_id=floor.id,
             status="accepted",
             activate=body.activate,
-            spec=body.model_dump(exclude={"survey_ids", "activate"}, exclude_none=True),
+            spec=body.model_dump(exclude={"survey_ids", "activate", "priority"}, exclude_none=True),
             survey_ids=_check_surveys(session, floor.id, body),
         )
         _check_engine(session, context, row)
         session.add(row)
         session.flush()
-        job = context.queue.enqueue_build(session, row)
+        job = context.queue.enqueue_build(session, row, PRIORITIES[body.priority])
         return 202, NewMapAnswer(map=show_map(row, floor.active_map_id), job=show_job(job))
 
     return answer_once(context, identity, request, key, body.model_dump_json().encode(), create)

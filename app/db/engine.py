@@ -4,6 +4,7 @@ SQLite: every write transaction begins IMMEDIATE, so it never fails half-way bec
 a plain SELECT takes no transaction and waits for nobody (WAL). Reads therefore behave as PostgreSQL's READ COMMITTED.
 """
 
+import logging
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -12,13 +13,13 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import Connection, Engine, create_engine, event, func, make_url, select, text
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.traced import trace_statements
-from app.errors import InvalidInput
+from app.errors import InvalidInput, Unavailable
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -28,6 +29,8 @@ __all__ = [
     "begin_writing",
     "create_database_engine",
     "downgrade",
+    "let_go_of_the_dead",
+    "lock_for_transaction",
     "migrate",
     "migrate_job_engine",
     "migration_lock",
@@ -38,7 +41,17 @@ __all__ = [
 ]
 
 BUSY_TIMEOUT_S = 30.0
+LOCK_TIMEOUT, STATEMENT_TIMEOUT = "2s", "30s"
+MIGRATION_PATIENCE_S = 300.0
+LOCKED_OUT = (
+    f"for {MIGRATION_PATIENCE_S:.0f} s other transactions held a table it changes. Nothing is lost: end the long ones "
+    "(PostgreSQL's view pg_stat_activity has each with its xact_start and query), and start again"
+)
+HELD_UP = ("55P03", "57014", "40P01")  # PostgreSQL: lock not available, statement timeout, deadlock
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
+
+
+log = logging.getLogger(__name__)
 
 
 def create_database_engine(url: str) -> Engine:
@@ -52,6 +65,7 @@ def create_database_engine(url: str) -> Engine:
             parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800, hide_parameters=True
         )
         trace_statements(engine)
+        event.listen(engine, "connect", let_go_of_the_dead)
         return engine
     engine = create_engine(
         parsed,
@@ -66,6 +80,14 @@ def create_database_engine(url: str) -> Engine:
     return engine
 
 
+def let_go_of_the_dead(connection: Any, _record: object) -> None:
+    """Listener: PostgreSQL ends a transaction, and its locks, 25 s after its client was cut off, not hours."""
+    if not isinstance(connection, sqlite3.Connection):
+        for name, value in (("idle", 10), ("interval", 5), ("count", 3)):
+            connection.execute(f"SET tcp_keepalives_{name} = {value}")
+        connection.commit()
+
+
 def session_factory(engine: Engine) -> sessionmaker[Session]:
     """Sessions whose objects stay readable after commit."""
     return sessionmaker(engine, expire_on_commit=False)
@@ -74,19 +96,22 @@ def session_factory(engine: Engine) -> sessionmaker[Session]:
 def migrate(database: Engine | str) -> None:
     """Bring the schema, ours and the job engine's, to this version.
 
-    Several processes may call this at once: one migrates, the others wait and find it done.
+    Several processes may call this at once: one migrates, the others wait and find it done. Others may read and write
+    meanwhile: on PostgreSQL no step waits for a lock longer than `LOCK_TIMEOUT`, because everybody else would wait
+    behind it; it is tried again. Raises Unavailable where a table stayed locked for `MIGRATION_PATIENCE_S`.
     """
     with _engine_of(database) as engine:
         prepare_sqlite_file(engine)
         with migration_lock(engine):
-            _run_alembic(engine, "upgrade", "head")
+            for revision in _revisions_to_come(engine):
+                _upgrade_patiently(engine, revision)
             migrate_job_engine(engine.url)
 
 
 def downgrade(database: Engine | str, revision: str = "base") -> None:
     """Take our schema back to `revision`; the job engine's own tables stay."""
     with _engine_of(database) as engine, migration_lock(engine):
-        _run_alembic(engine, "downgrade", revision)
+        _downgrade(engine, revision)
 
 
 def migration_state(engine: Engine) -> tuple[str | None, str | None]:
@@ -173,9 +198,23 @@ def _prepare_sqlite_connection(connection: sqlite3.Connection, _record: object) 
         connection.execute(f"PRAGMA {pragma}")
 
 
+def lock_for_transaction(session: Session, number: int) -> None:
+    """Until the transaction ends no other one gets past here with the same number. SQLite has one writer anyway."""
+    connection = session.connection()
+    if connection.dialect.name == "sqlite":
+        _begin_immediate(connection)
+    else:
+        connection.execute(select(func.pg_advisory_xact_lock(number)))
+
+
 def _begin_before_savepoint(connection: Connection, _name: str) -> None:
     # sqlite3 begins before INSERT, UPDATE and DELETE only: a savepoint set first would be a transaction of its own,
     # and releasing it would commit.
+    _begin_immediate(connection)
+
+
+def _begin_immediate(connection: Connection) -> None:
+    """Become SQLite's writer, where this transaction is not yet."""
     driver = connection.connection.driver_connection
     if isinstance(driver, sqlite3.Connection) and not driver.in_transaction:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
@@ -215,15 +254,64 @@ def migration_lock(engine: Engine) -> Iterator[None]:
             connection.execute(text("SELECT pg_advisory_unlock(:n)"), {"n": MIGRATION_LOCK})
 
 
-def _run_alembic(engine: Engine, verb: str, revision: str) -> None:
+def _revisions_to_come(engine: Engine) -> list[str]:
+    """The revisions this version knows and the schema has not, oldest first; of a newer schema, none."""
+    from alembic.script import ScriptDirectory
+
+    at, _ = migration_state(engine)
+    known = [each.revision for each in ScriptDirectory.from_config(alembic_config()).walk_revisions()][::-1]
+    if at is not None and at not in known:
+        return []
+    return known[known.index(at) + 1 :] if at is not None else known
+
+
+def _upgrade_patiently(engine: Engine, revision: str) -> None:
+    """One step, tried again for a while where a table is locked: a long transaction of somebody else."""
+    deadline, wait_s = time.monotonic() + MIGRATION_PATIENCE_S, 0.5
+    while True:
+        try:
+            return _upgrade(engine, revision)
+        except OperationalError as error:
+            if getattr(error.orig, "sqlstate", None) not in HELD_UP:
+                raise
+            if time.monotonic() + wait_s > deadline:
+                raise Unavailable(f"the database could not be brought to schema {revision}: {LOCKED_OUT}") from error
+            log.warning("schema %s waits %.1f s for a lock that somebody holds", revision, wait_s)
+            time.sleep(wait_s)
+            wait_s = min(2.0 * wait_s, 10.0)
+
+
+def _upgrade(engine: Engine, revision: str) -> None:
+    """SQLite: in a transaction begun here. PostgreSQL: in Alembic's, which a step may leave (`migrations.steps`)."""
+    from alembic import command
+
+    from migrations.steps import WHILE_OTHERS_WRITE
+
+    config = alembic_config()
+    config.attributes[WHILE_OTHERS_WRITE] = True
+    with engine.connect() as connection:
+        if engine.dialect.name == "postgresql":
+            connection.exec_driver_sql(f"SET lock_timeout = '{LOCK_TIMEOUT}'")
+            connection.exec_driver_sql(f"SET statement_timeout = '{STATEMENT_TIMEOUT}'")
+            connection.commit()
+        else:
+            begin_writing(connection)
+        config.attributes["connection"] = connection
+        try:
+            command.upgrade(config, revision)
+            connection.commit()
+        finally:
+            connection.invalidate()  # not back into the pool: the timeouts go with it
+
+
+def _downgrade(engine: Engine, revision: str) -> None:
     from alembic import command
 
     config = alembic_config()
-    run: Any = getattr(command, verb)
     with engine.connect() as connection:
         begin_writing(connection)
         config.attributes["connection"] = connection
-        run(config, revision)
+        command.downgrade(config, revision)
         connection.commit()
 
 

@@ -16,6 +16,7 @@ from sqlalchemy import (
     Index,
     LargeBinary,
     MetaData,
+    SmallInteger,
     String,
     UniqueConstraint,
 )
@@ -213,17 +214,24 @@ class Map(Base):
 class Job(Base):
     """What a user sees of background work. `workflow_id` names it in the engine: one row per workflow.
 
-    `status`: accepted, running, successful, failed, dismissed (OGC API Processes). `request_id` and `traceparent`
-    are of the request that asked for it first, for the log and for traces."""
+    `status`: accepted, running, successful, failed, dismissed (OGC API Processes). `priority`: 1, 2 or 3, the first
+    served first; `admitted_at`: when the job was handed to the engine (`app.jobs.admission`). `request_id` and
+    `traceparent` are of the request that asked for it first, for the log and for traces."""
 
     __tablename__ = "job"
-    __table_args__ = (Index("ix_job_organisation_id_id", "organisation_id", "id"),)
+    __table_args__ = (
+        Index("ix_job_organisation_id_id", "organisation_id", "id"),
+        Index("ix_job_organisation_id_admitted_at", "organisation_id", "admitted_at"),
+        Index("ix_job_status_floor_id", "status", "floor_id"),
+    )
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
     organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
     floor_id: Mapped[str] = mapped_column(Id)
     map_id: Mapped[str | None] = mapped_column(Id)
     kind: Mapped[str] = mapped_column(String(40))
     workflow_id: Mapped[str] = mapped_column(String(120), unique=True)
+    priority: Mapped[int] = mapped_column(SmallInteger, default=2, server_default="2")
+    admitted_at: Mapped[datetime | None]
     status: Mapped[str] = mapped_column(String(20), default="accepted")
     progress: Mapped[int] = mapped_column(default=0)
     message: Mapped[str] = mapped_column(default="waiting for a worker")
@@ -294,13 +302,15 @@ class TrackState(Base):
 
 
 class Worker(Base):
-    """The lease of a worker process (docs/decisions/0003): `beat` is the database's clock, `state` live or dead."""
+    """The lease of a worker process (docs/decisions/0003): `beat` is the database's clock, `state` live or dead;
+    `slots` are the jobs it runs at one time, null for a version that admits none (docs/decisions/0016)."""
 
     __tablename__ = "worker"
     id: Mapped[str] = mapped_column(String(120), primary_key=True)
     state: Mapped[str] = mapped_column(String(10))
     beat: Mapped[datetime]
     reaper: Mapped[str | None] = mapped_column(String(120))
+    slots: Mapped[int | None]
 
 
 class Idempotency(Base):

@@ -6,10 +6,10 @@ The names are constants and never change meaning: rows written by older versions
 import logging
 
 from dbos import DBOSClient, DBOSConfig, DBOSPortableJSONSerializer
-from sqlalchemy import Engine
+from sqlalchemy import Engine, event
 from sqlalchemy.engine import URL
 
-from app.db.engine import teach_old_sqlite
+from app.db.engine import let_go_of_the_dead, teach_old_sqlite
 
 __all__ = ["APPLICATION", "APPLICATION_VERSION", "QUEUE", "engine_configuration", "open_client"]
 
@@ -35,6 +35,8 @@ def open_client(engine: Engine) -> DBOSClient:
 def engine_configuration(url: URL, executor_id: str) -> DBOSConfig:
     """The engine's configuration in a worker or a janitor."""
     teach_old_sqlite()
+    if not event.contains(Engine, "connect", let_go_of_the_dead):
+        event.listen(Engine, "connect", let_go_of_the_dead)  # the engine makes engines of its own
     return DBOSConfig(
         name=APPLICATION,
         system_database_url=url.render_as_string(hide_password=False),

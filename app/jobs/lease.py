@@ -22,8 +22,9 @@ LONG_AGO = datetime(2000, 1, 1, tzinfo=UTC)
 class Lease:
     """The lease of this process, beaten from a thread of its own every quarter of the time to live."""
 
-    def __init__(self, engine: Engine, worker_id: str, ttl_s: float) -> None:
-        self.worker_id, self.ttl_s = worker_id, ttl_s
+    def __init__(self, engine: Engine, worker_id: str, ttl_s: float, slots: int = 1) -> None:
+        """`slots`: the jobs that this worker runs at one time."""
+        self.worker_id, self.ttl_s, self._slots = worker_id, ttl_s, slots
         self._engine = engine
         self._fenced = False
         self._beaten_s = time.monotonic()
@@ -32,7 +33,7 @@ class Lease:
 
     def start(self) -> None:
         """Write the row and begin to beat."""
-        row = insert(Worker).values(id=self.worker_id, state="live", beat=self._clock())
+        row = insert(Worker).values(id=self.worker_id, state="live", beat=self._clock(), slots=self._slots)
         with self._engine.begin() as connection:
             connection.execute(row)
         self._beaten_s = time.monotonic()
@@ -67,7 +68,8 @@ class Lease:
     def take_over_from_dead(self, known_dead: Collection[str] = ()) -> list[str]:
         """Become the heir of every worker whose beat is too old or that is known to be dead, and return their ids.
 
-        An heir that dies too before it calls `bury` leaves a dead row whose beat grows old again.
+        An heir that dies too before it calls `bury` leaves a dead row whose beat grows old again. A beat of the future
+        is from before the clock was set back: whoever lives soon beats again.
         """
         dead = (
             update(Worker)
@@ -75,6 +77,7 @@ class Lease:
                 Worker.id != self.worker_id,
                 or_(
                     Worker.beat < self._clock(-self.ttl_s),
+                    Worker.beat > self._clock(self.ttl_s),
                     and_(Worker.state == "live", Worker.id.in_(known_dead)),
                 ),
             )

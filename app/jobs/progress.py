@@ -24,7 +24,7 @@ class JobReporter:
         sessions: sessionmaker[Session],
         job_id: str,
         still_owner: Callable[[int], None],
-        interval_s: float = 0.5,
+        interval_s: float = 1.0,
     ) -> None:
         """`still_owner(progress)` raises when the job has been given to another worker. Reports closer together than
         `interval_s` are dropped, so a chatty fit costs at most two small transactions a second."""

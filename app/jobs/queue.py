@@ -1,7 +1,8 @@
 """Asking for background work, in the caller's transaction.
 
 Every change to the jobs of a floor locks the floor's row first, so it is serial per floor on both databases; locks are
-always taken in the order floor, job, anything else.
+always taken in the order floor, job, anything else, and last the one of the admission: whoever adds or ends a job
+admits those that are next (`app.jobs.admission`) before it commits.
 """
 
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.db.tables import BUILD, REBUILD, Floor, Job, Map
 from app.errors import NotFound
+from app.jobs.admission import LOW, NORMAL, admit_next
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from app.telemetry.facts import request_id
 from app.telemetry.tracing import traceparent
@@ -46,11 +48,12 @@ class JobQueue:
             organisation_id=floor.organisation_id,
             floor_id=floor.id,
             kind=REBUILD,
+            priority=LOW,
             workflow_id=_rebuild_id(floor.id, generation),
         )
-        return self._enqueue(session, job, floor.id, generation)
+        return self._add(session, job)
 
-    def enqueue_build(self, session: Session, map_row: Map) -> Job:
+    def enqueue_build(self, session: Session, map_row: Map, priority: int = NORMAL) -> Job:
         """The job that builds this map row; the same one when asked again. Raises NotFound if the floor is gone."""
         session.flush()
         lock_floor(session, map_row.floor_id)
@@ -63,15 +66,28 @@ class JobQueue:
             floor_id=map_row.floor_id,
             map_id=map_row.id,
             kind=BUILD,
+            priority=priority,
             workflow_id=workflow_id,
         )
-        return self._enqueue(session, job, map_row.id)
+        return self._add(session, job)
+
+    def admit(self, session: Session) -> None:
+        """Hand the jobs that are next to the engine, as far as slots of live workers are free."""
+        for job in admit_next(session):
+            options = EnqueueOptions(
+                workflow_name=job.kind,
+                workflow_id=job.workflow_id,
+                queue_name=QUEUE,
+                queue_partition_key=job.floor_id,
+                app_version=APPLICATION_VERSION,
+            )
+            self._client.enqueue_in_transaction(session, options, *_arguments(job))  # known already: it stays as it is
 
     def request_cancel(self, session: Session, job: Job) -> Job:
         """End a waiting job now; ask a running one to end at its next report. A job that has ended stays as it is.
 
-        The engine's own entry of a waiting job is not touched: when its turn comes it finds the job dismissed and
-        ends, so there is no moment in which the two disagree.
+        The engine's own entry of a waiting job that was admitted is not touched: when its turn comes it finds the job
+        dismissed and ends, so there is no moment in which the two disagree.
         """
         generation = lock_floor(session, job.floor_id) + 1
         session.refresh(job)
@@ -82,22 +98,19 @@ class JobQueue:
             _dismiss(session, job)
             if job.workflow_id == _rebuild_id(job.floor_id, generation):
                 claim_generation(session, job.floor_id, generation)
+            self.admit(session)
         session.flush()
         return job
 
     def enqueue_again(self, session: Session, job: Job) -> None:
-        """Let a job that had not ended begin anew under its old name, where the engine knows nothing of it.
+        """Let a job that had not ended wait anew under its old name, where the engine knows nothing of it.
 
         For a database that was restored: the engine's own tables are not restored with ours.
         """
-        job.status, job.progress, job.started_at = "accepted", 0, None
+        job.status, job.progress, job.started_at, job.admitted_at = "accepted", 0, None, None
         job.message = "waiting for a worker, anew: the installation was restored from a backup"
         begun = update(Map).where(Map.id == job.map_id, Map.status == "running")
         session.execute(begun.values(status="accepted"))
-        if job.kind == REBUILD:
-            self._enqueue(session, job, job.floor_id, int(job.workflow_id.rsplit(":", 1)[1]))
-        else:
-            self._enqueue(session, job, str(job.map_id))
 
     def recorded(self, session: Session) -> Iterator[object]:
         """What the engine has recorded of the steps of every job that has not ended: plans and results."""
@@ -112,18 +125,10 @@ class JobQueue:
     def close(self) -> None:
         self._client.destroy()
 
-    def _enqueue(self, session: Session, job: Job, *arguments: str | int) -> Job:
+    def _add(self, session: Session, job: Job) -> Job:
         job.request_id, job.traceparent = request_id(), traceparent()
         session.add(job)
-        session.flush()
-        options = EnqueueOptions(
-            workflow_name=job.kind,
-            workflow_id=job.workflow_id,
-            queue_name=QUEUE,
-            queue_partition_key=job.floor_id,
-            app_version=APPLICATION_VERSION,
-        )
-        self._client.enqueue_in_transaction(session, options, *arguments)
+        self.admit(session)
         return job
 
 
@@ -157,6 +162,13 @@ def _dismiss(session: Session, job: Job) -> None:
     job.status, job.message, job.finished_at = "dismissed", "cancelled before it started", datetime.now(UTC)
     ended = update(Map).where(Map.id == job.map_id, Map.status == "accepted")
     session.execute(ended.values(status="dismissed", finished_at=job.finished_at))
+
+
+def _arguments(job: Job) -> tuple[str | int, ...]:
+    """What the job's workflow is called with (`workers.workflows`)."""
+    if job.kind == REBUILD:
+        return job.floor_id, int(job.workflow_id.rsplit(":", 1)[1])
+    return (str(job.map_id),)
 
 
 def _rebuild_id(floor_id: str, generation: int) -> str:

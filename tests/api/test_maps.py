@@ -220,6 +220,19 @@ def test_activation_moves_the_pointer_both_ways(service: Any, mapped_floor: str,
     assert service.http.post(f"/v1/maps/{active_map}/activate").json()["active"] is True
 
 
+def test_a_priority_is_of_the_job_not_of_the_map(service: Any, mapped_floor: str) -> None:
+    def ask(priority: str) -> Any:
+        return service.http.post(f"/v1/floors/{mapped_floor}/maps", json={"activate": False, "priority": priority})
+
+    asked = {priority: ask(priority) for priority in ("low", "normal", "high")}
+    assert {answer.status_code for answer in asked.values()} == {202}
+    assert ask("urgent").status_code == 422
+    service.run_jobs()
+    maps = [service.http.get(f"/v1/maps/{answer.json()['map']['id']}").json() for answer in asked.values()]
+    assert len({row["sha256"] for row in maps}) == 1
+    assert {row["status"] for row in maps} == {"ready"}
+
+
 def test_a_map_of_nothing_is_refused(service: Any, new_floor: Callable[..., str]) -> None:
     floor = new_floor()
     assert service.http.post(f"/v1/floors/{floor}/maps", json={}).status_code == 409

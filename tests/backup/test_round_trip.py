@@ -4,7 +4,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from sqlalchemy import func, select, text
 from app import __version__
 from app.db.engine import create_database_engine, migration_state
 from app.db.snapshot import known_revisions, made_at_once, move_schema
-from app.db.tables import Base, Job, Map, Organisation, Survey, new_id
+from app.db.tables import Base, Job, Map, Organisation, Survey, Worker, new_id
 from app.errors import Conflict, InvalidInput
 from app.services.backup_archive import ArchiveReader, ArchiveWriter, Manifest, StoredTable
 from app.services.make_backup import LEFT_OUT
@@ -65,6 +65,9 @@ def test_jobs_that_had_not_ended_wait_again_in_the_engine(
     site.back_up(tmp_path / "1.zip")
     there, done = restore(tmp_path / "1.zip")
     assert done.jobs == 2
+    with there.sessions.begin() as session:
+        session.add(Worker(id="first", state="live", beat=datetime.now(UTC), slots=2))
+        there.queue.admit(session)
     queued = {each.workflow_id: each for each in there.queue._client.list_workflows()}
     with there.sessions.begin() as session:
         jobs = session.scalars(select(Job)).all()

@@ -97,6 +97,11 @@ class Server:
         raise AssertionError(f"{job}\n{(self.folder / 'server.log').read_text()}")
 
 
+@pytest.fixture(scope="session")
+def server_of() -> type[Server]:
+    return Server
+
+
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
     server = Server(tmp_path)

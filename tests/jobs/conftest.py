@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -40,6 +40,11 @@ class Site:
         self.engine, self.sessions, self.queue = engine, sessions, queue
 
     def floor(self, **orders: object) -> Floor:
+        """One, of an organisation of its own."""
+        return self.floors(1, **orders)[0]
+
+    def floors(self, count: int, **orders: object) -> list[Floor]:
+        """Several, of one organisation of their own."""
         with self.sessions.begin() as session:
             organisation = Organisation(name=f"organisation {uuid4()}")
             session.add(organisation)
@@ -47,15 +52,18 @@ class Site:
             building = Building(organisation_id=organisation.id, name="b")
             session.add(building)
             session.flush()
-            floor = Floor(
-                organisation_id=organisation.id,
-                building_id=building.id,
-                name=json.dumps(orders),
-                ordinal=0,
-                elevation_m=0.0,
-            )
-            session.add(floor)
-        return floor
+            floors = [
+                Floor(
+                    organisation_id=organisation.id,
+                    building_id=building.id,
+                    name=json.dumps(orders),
+                    ordinal=0,
+                    elevation_m=0.0,
+                )
+                for _ in range(count)
+            ]
+            session.add_all(floors)
+        return floors
 
     def upload(self, floor: Floor) -> tuple[str, str]:
         """A survey row and its rebuild in one transaction: their ids."""
@@ -76,8 +84,13 @@ class Site:
         with self.sessions() as session:
             return session.get_one(Job, job_id)
 
-    def wait(self, job_id: str, until: Callable[[Job], bool] = lambda job: job.status in FINAL_STATES) -> Job:
-        deadline = time.monotonic() + PATIENCE_S
+    def wait(
+        self,
+        job_id: str,
+        until: Callable[[Job], bool] = lambda job: job.status in FINAL_STATES,
+        patience_s: float = PATIENCE_S,
+    ) -> Job:
+        deadline = time.monotonic() + patience_s
         while not until(job := self.job(job_id)):
             if time.monotonic() > deadline:
                 pytest.fail(f"job {job_id} is still {job.status} at {job.progress} %: {job.message}")
@@ -119,14 +132,16 @@ class Crew:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     @staticmethod
-    def command(**options: object) -> list[str]:
-        return [sys.executable, "-c", START, json.dumps({"lease_ttl_s": 3.0, **options})]
+    def command(code: str = START, **options: Any) -> list[str]:
+        return [sys.executable, "-c", code, json.dumps({"lease_ttl_s": 3.0, **options})]
 
-    def hire(self, data_dir: str = "var", **options: object) -> subprocess.Popen[bytes]:
-        """Start a worker. Workers with another data folder cannot see each other die, as on two machines."""
+    def hire(self, data_dir: str = "var", prefix: Sequence[str] = (), **options: Any) -> subprocess.Popen[bytes]:
+        """Start a worker. Workers with another data folder cannot see each other die, as on two machines.
+
+        `prefix` goes before the command; `code` is what it runs, where that is not `run_worker`."""
         environment = {**self.environment, "ISODYN_DATA_DIR": str(self.folder / data_dir)}
         with self._log.open("a") as log:
-            process = subprocess.Popen(self.command(**options), env=environment, stderr=log)
+            process = subprocess.Popen([*prefix, *self.command(**options)], env=environment, stderr=log)
         self._processes.append(process)
         return process
 

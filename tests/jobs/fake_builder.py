@@ -1,7 +1,8 @@
 """A builder without mathematics for the worker's tests: sleeps in slices, and writes a diary beside the blobs.
 
 What a fit does is said by the map's spec or, for rebuilds, by the floor's name: a JSON object with `sleep_s`, `fail`,
-`die_times`, `silent`.
+`die_times`, `silent`; `claim_s` holds the floor locked that long, `hold_s` keeps the fit's interpreter busy and lets no
+other thread in, `kill_worker` takes the worker down with the fit.
 """
 
 import json
@@ -52,6 +53,9 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
     job.status = row.status = "running"
     job.started_at = datetime.now(UTC)
     orders = {**json.loads(floor.name), **row.spec}
+    if "claim_s" in orders:
+        note("claim starts", floor_id=floor.id)
+        time.sleep(orders["claim_s"])
     if orders.get("fail_claim"):
         raise InvalidInput("there is nothing to build; upload a survey")
     return {"map_id": row.id, "floor_id": floor.id, "sequence": row.sequence, "surveys": row.survey_ids, **orders}
@@ -66,6 +70,12 @@ def fit_build(plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float,
     started = sum(e["event"] == "fit starts" and e["map_id"] == plan["map_id"] for e in map(json.loads, open(DIARY)))  # noqa: PTH123, SIM115
     if started <= plan.get("die_times", 0):
         os.kill(os.getpid(), signal.SIGKILL)
+    if plan.get("kill_worker"):
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(60)
+    began = time.monotonic()
+    while time.monotonic() - began < plan.get("hold_s", 0.0):
+        sum(range(50_000_000))  # a second or so in compiled code that never lets go of the interpreter
     slices = max(1, round(plan.get("sleep_s", 0.2) / 0.05))
     for n in range(slices):
         if not plan.get("silent"):

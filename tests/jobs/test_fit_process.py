@@ -1,14 +1,39 @@
 """A fit in its child process, without a worker around it."""
 
+import json
+import os
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from workers.fit_process import FitProcessDied, run_fit
+from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
+
+
+def quiet(fraction: float, message: str) -> None:
+    """Progress that nobody follows."""
+
+
+def test_a_child_that_did_well_is_kept_for_the_next_fit_and_another_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    diary = tmp_path / "diary"
+    monkeypatch.setenv("ISODYN_TEST_DIARY", str(diary))
+    fits, blobs = FitProcesses(), f"file://{tmp_path}"
+    plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
+    for orders in ({}, {}, {"fail": True}, {}):
+        with nullcontext() if not orders else pytest.raises(FitFailed, match="walk the floor again"):
+            fits.run("tests.jobs.fake_builder", plan | orders, blobs, quiet)
+    fits.close()
+    pids = [entry["pid"] for entry in map(json.loads, diary.read_text().splitlines()) if entry["event"] == "fit starts"]
+    assert pids[0] == pids[1] == pids[2] != pids[3]
+    for pid in set(pids):
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
 
 
 def test_a_fit_that_makes_no_progress_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ISODYN_TEST_DIARY", str(tmp_path / "diary"))
     plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 60.0, "silent": True}
     with pytest.raises(FitProcessDied, match="no progress"):
-        run_fit("tests.jobs.fake_builder", plan, f"file://{tmp_path}", lambda fraction, message: None, silence_s=1.0)
+        FitProcesses().run("tests.jobs.fake_builder", plan, f"file://{tmp_path}", quiet, silence_s=1.0)

@@ -1,12 +1,14 @@
 """The lease: a dead worker has one heir, a living one is left alone, a lost lease is known to its holder."""
 
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 from uuid import uuid4
 
 import pytest
-from sqlalchemy import Engine, select, update
+from sqlalchemy import Engine, event, select, text, update
 
 from app.db.tables import Worker
 from app.jobs.lease import LONG_AGO, Lease
@@ -87,6 +89,65 @@ def test_leaving_jobs_behind_they_are_taken_over_at_once(engine: Engine, lease: 
     leaver.release(unfinished=True)
     assert not leaver.is_lost
     assert heir.take_over_from_dead() == [leaver.worker_id]
+
+
+@pytest.fixture
+def clock(engine: Engine) -> Iterator[Callable[[float], None]]:
+    """Sets the database's clock by so many seconds, as connections made from now on see it."""
+    shift_s = 0.0
+
+    def strftime(form: str, *modifiers: str) -> str:
+        return str(plain.execute(f"SELECT strftime(?, {', '.join('?' * len(modifiers))}, ?)",
+                                 (form, *modifiers, f"{shift_s:+.3f} seconds")).fetchone()[0])  # fmt: skip
+
+    def on_connect(connection: Any, _record: object) -> None:
+        if engine.dialect.name == "sqlite":
+            connection.create_function("strftime", -1, strftime)
+        else:
+            connection.execute("SET search_path = shifted, pg_catalog, public")
+            connection.commit()
+
+    def shift(by_s: float) -> None:
+        nonlocal shift_s
+        shift_s = by_s
+        if engine.dialect.name == "postgresql":
+            body = f"SELECT pg_catalog.clock_timestamp() + interval '{by_s} seconds'"
+            with engine.begin() as connection:
+                connection.execute(text(f"CREATE OR REPLACE FUNCTION shifted.clock_timestamp() RETURNS timestamptz "
+                                        f"LANGUAGE sql AS $$ {body} $$"))  # fmt: skip
+
+    plain = sqlite3.connect(":memory:", check_same_thread=False)
+    if engine.dialect.name == "postgresql":
+        with engine.begin() as connection:
+            connection.execute(text("CREATE SCHEMA IF NOT EXISTS shifted"))
+    shift(0.0)
+    event.listen(engine, "connect", on_connect)
+    engine.dispose()
+    yield shift
+    event.remove(engine, "connect", on_connect)
+    engine.dispose()
+    plain.close()
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_a_clock_that_is_set_costs_at_most_a_restart_and_hides_no_death(
+    engine: Engine, lease: MakeLease, clock: Callable[[float], None], step_s: float
+) -> None:
+    dead, heir = lease(ttl_s=1.0), lease(ttl_s=1.0)
+    dead._stopping.set()
+    clock(step_s)
+    worker = lease(ttl_s=1.0)  # restarted, where the step cost it its life
+    taken: list[str] = []
+    deadline = time.monotonic() + 20.0
+    while dead.worker_id not in taken:
+        assert time.monotonic() < deadline
+        taken += heir.take_over_from_dead()
+        time.sleep(0.1)
+    for _ in range(20):  # twice the time to live
+        taken += heir.take_over_from_dead()
+        time.sleep(0.1)
+    assert worker.worker_id not in taken
+    assert worker.beat()
 
 
 def test_without_a_beat_for_the_time_to_live_it_is_lost(engine: Engine) -> None:

@@ -1,12 +1,14 @@
 """Asking for work: atomic with the caller's rows, one waiting rebuild per floor, on both databases."""
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 
 import pytest
-from sqlalchemy import Engine, func, select, text
+from sqlalchemy import Engine, delete, func, select, text
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.db.tables import Floor, Job, Map
+from app.db.tables import Floor, Job, Map, Worker
 from app.errors import NotFound
 from app.jobs import JobQueue
 from app.jobs.queue import claim_generation
@@ -25,6 +27,17 @@ def engine_entries(engine: Engine, name: str) -> list[tuple[str, str, str]]:
         return [tuple(row) for row in connection.execute(text(query), {"name": name})]
 
 
+@pytest.fixture
+def slots(sessions: sessionmaker[Session]) -> Iterator[None]:
+    """A live worker with slots for everybody: what is enqueued is admitted at once."""
+    with sessions.begin() as session:
+        session.add(Worker(id="patient", state="live", beat=datetime.now(UTC), slots=1000))
+    yield
+    with sessions.begin() as session:
+        session.execute(delete(Worker).where(Worker.id == "patient"))
+
+
+@pytest.mark.usefixtures("slots")
 def test_a_rebuild_is_a_row_and_an_entry(
     engine: Engine, sessions: sessionmaker[Session], queue: JobQueue, floor: Floor
 ) -> None:
@@ -34,6 +47,7 @@ def test_a_rebuild_is_a_row_and_an_entry(
     assert engine_entries(engine, job.workflow_id) == [("ENQUEUED", "floors", floor.id)]
 
 
+@pytest.mark.usefixtures("slots")
 def test_rolled_back_it_leaves_neither(
     engine: Engine, sessions: sessionmaker[Session], queue: JobQueue, floor: Floor
 ) -> None:
@@ -63,6 +77,7 @@ def test_uploads_share_the_waiting_rebuild(sessions: sessionmaker[Session], queu
     assert [job.workflow_id.rsplit(":", 1)[1] for job in jobs] == ["1", "2"]
 
 
+@pytest.mark.usefixtures("slots")
 def test_a_build_per_map(engine: Engine, sessions: sessionmaker[Session], queue: JobQueue, floor: Floor) -> None:
     with sessions.begin() as session:
         row = a_map(session, floor)

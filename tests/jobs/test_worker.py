@@ -179,11 +179,10 @@ def test_a_job_cancelled_in_the_engine_by_an_operator_does_not_stay_open(crew: "
     floor = site.floor(sleep_s=1.0)
     _, running = site.upload(floor)
     site.wait_running(running)
-    _, waiting = site.upload(floor)
     client = open_client(site.engine)
-    client.cancel_workflow(site.job(waiting).workflow_id)
+    client.cancel_workflow(site.job(running).workflow_id)
     client.destroy()
-    job = site.wait(waiting)
+    job = site.wait(running)
     assert (job.status, job.message) == ("failed", "cancelled in the job engine by an operator")
     assert site.wait(site.upload(floor)[1]).status == "successful"
 

@@ -1,0 +1,111 @@
+"""Which waiting jobs go to the engine next (docs/decisions/0016).
+
+Jobs wait in our own table. They are handed to the engine only as slots of live workers are free, because the engine
+draws floors at random: what it holds must be what should run now. Among organisations it is the turn of the one with
+the fewest jobs in hand, then of the one whose last turn is longest ago; within one it goes by priority, then by age.
+"""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from sqlalchemy import func, or_, select
+from sqlalchemy.orm import Session, aliased
+
+from app.db.engine import lock_for_transaction
+from app.db.tables import Job, Worker
+
+__all__ = ["HIGH", "LOW", "NORMAL", "admit_next"]
+
+HIGH, NORMAL, LOW = 1, 2, 3
+"""Priorities, the first served first. What somebody asked for is normal, what follows from an upload is low."""
+
+LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
+ADMISSION_LOCK = 0x150D_12  # any constant of our own: PostgreSQL's advisory locks are numbers
+
+
+@dataclass(slots=True)
+class _Turn:
+    """Where an organisation stands: its jobs in hand, when it had its last turn, and what it has waiting."""
+
+    in_hand: int
+    last: datetime
+    waiting: list[Job]
+
+
+def admit_next(session: Session) -> list[Job]:
+    """Mark as admitted, and return, the jobs that the free slots are for; never two of one floor.
+
+    One transaction at a time, until it ends; it must have locked whatever else it needs before.
+    """
+    lock_for_transaction(session, ADMISSION_LOCK)
+    session.flush()
+    in_hand = session.execute(
+        select(Job.organisation_id, Job.floor_id).where(
+            or_(Job.status == "running", (Job.status == "accepted") & Job.admitted_at.is_not(None))
+        )
+    ).all()
+    room = _slots(session) - len(in_hand)
+    if room <= 0:
+        return []
+    turns = _turns(session, room, {row.floor_id for row in in_hand})
+    for row in in_hand:
+        if row.organisation_id in turns:
+            turns[row.organisation_id].in_hand += 1
+    admitted: list[Job] = []
+    while turns and len(admitted) < room:
+        organisation_id, turn = min(
+            turns.items(), key=lambda item: (item[1].in_hand, item[1].last, item[1].waiting[0].id)
+        )
+        job = turn.waiting.pop(0)
+        job.admitted_at = turn.last = datetime.now(UTC)
+        turn.in_hand += 1
+        admitted.append(job)
+        if not turn.waiting:
+            del turns[organisation_id]
+    session.flush()
+    return admitted
+
+
+def _slots(session: Session) -> int:
+    """Jobs that the live workers run at one time. One of an older version admits nobody: with it there, all are."""
+    slots = session.scalars(select(Worker.slots).where(Worker.state == "live")).all()
+    return 2**31 if None in slots else sum(each for each in slots if each is not None)
+
+
+def _turns(session: Session, room: int, busy_floors: set[str]) -> dict[str, _Turn]:
+    """The organisations with jobs that could start, each with the first `room` of them, one a floor."""
+    order = (Job.priority, Job.id)
+    of_floor = (
+        select(
+            Job.id, Job.organisation_id, Job.priority,
+            func.row_number().over(partition_by=Job.floor_id, order_by=order).label("place"),
+        )
+        .where(Job.status == "accepted", Job.admitted_at.is_(None), Job.floor_id.not_in(busy_floors))
+        .subquery()
+    )  # fmt: skip
+    of_organisation = (
+        select(
+            of_floor.c.id,
+            func.row_number()
+            .over(partition_by=of_floor.c.organisation_id, order_by=(of_floor.c.priority, of_floor.c.id))
+            .label("place"),
+        )
+        .where(of_floor.c.place == 1)
+        .subquery()
+    )
+    earlier = aliased(Job)
+    last_turn = (
+        select(func.max(earlier.admitted_at)).where(earlier.organisation_id == Job.organisation_id).scalar_subquery()
+    )
+    rows = session.execute(
+        select(Job, last_turn)
+        .join(of_organisation, of_organisation.c.id == Job.id)
+        .where(of_organisation.c.place <= room)
+        .order_by(*order)
+        .with_for_update(of=Job, skip_locked=True)  # whoever changes one now comes here, too, before it ends
+        .execution_options(populate_existing=True)
+    )
+    turns: dict[str, _Turn] = {}
+    for job, last in rows:
+        turns.setdefault(job.organisation_id, _Turn(0, last or LONG_AGO, [])).waiting.append(job)
+    return turns

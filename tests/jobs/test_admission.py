@@ -1,0 +1,190 @@
+"""Whose job is next: fair between organisations, by priority and age within one, never two of one floor."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import pytest
+from sqlalchemy import Engine, delete, select, update
+from sqlalchemy.orm import Session, sessionmaker
+
+from app.db.tables import Floor, Job, Map, Worker
+from app.jobs import JobQueue
+from app.jobs.admission import HIGH, LOW, NORMAL
+from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
+
+if TYPE_CHECKING:
+    from conftest import Site
+
+Hire = Callable[[int | None], None]
+
+
+@pytest.fixture
+def hire(sessions: sessionmaker[Session]) -> Iterator[Hire]:
+    """Rows of live workers with so many slots; before and after the test there is no worker and no job."""
+
+    def clear() -> None:
+        with sessions.begin() as session:
+            session.execute(delete(Worker))
+            session.execute(delete(Job))
+
+    def hire(slots: int | None) -> None:
+        with sessions.begin() as session:
+            count = len(session.scalars(select(Worker.id)).all())
+            session.add(Worker(id=f"worker {count}", state="live", beat=datetime.now(UTC), slots=slots))
+
+    clear()
+    yield hire
+    clear()
+
+
+def upload(site: "Site", floors: list[Floor]) -> list[str]:
+    """Rebuilds of all floors, in one transaction: the jobs' ids."""
+    with site.sessions.begin() as session:
+        return [site.queue.enqueue_rebuild(session, session.get_one(Floor, floor.id)).id for floor in floors]
+
+
+def ask(site: "Site", floor: Floor, priority: int) -> str:
+    with site.sessions.begin() as session:
+        row = Map(organisation_id=floor.organisation_id, floor_id=floor.id, status="accepted", spec={}, survey_ids=[])
+        session.add(row)
+        return site.queue.enqueue_build(session, row, priority).id
+
+
+def in_hand(site: "Site") -> list[Job]:
+    with site.sessions() as session:
+        waiting = select(Job).where(Job.admitted_at.is_not(None), Job.status.in_(("accepted", "running")))
+        return list(session.scalars(waiting.order_by(Job.admitted_at)))
+
+
+def end(site: "Site", job_id: str) -> None:
+    """As the worker does it: the last state and the next admission in one transaction."""
+    with site.sessions.begin() as session:
+        session.get_one(Job, job_id).status = "successful"
+        site.queue.admit(session)
+
+
+def admit(site: "Site") -> None:
+    with site.sessions.begin() as session:
+        site.queue.admit(session)
+
+
+def known_to_the_engine(engine: Engine) -> list[str]:
+    client = open_client(engine)
+    names = [entry.workflow_id for entry in client.list_workflows(status="ENQUEUED")]
+    client.destroy()
+    return names
+
+
+def test_without_a_worker_jobs_wait_in_our_table_only(site: "Site", hire: Hire, engine: Engine) -> None:
+    (job_id,) = upload(site, [site.floor()])
+    name = site.job(job_id).workflow_id
+    assert name not in known_to_the_engine(engine)
+    hire(1)
+    admit(site)
+    assert name in known_to_the_engine(engine)
+    assert site.job(job_id).status == "accepted"
+
+
+def test_one_with_many_waiting_does_not_starve_the_others(site: "Site", hire: Hire) -> None:
+    hire(2)
+    first = upload(site, site.floors(20))
+    (second,) = upload(site, [site.floor()])
+    running = [job.id for job in in_hand(site)]
+    assert set(running) < set(first)
+    assert len(running) == 2
+    end(site, running[0])
+    assert second in {job.id for job in in_hand(site)}
+
+
+@pytest.mark.parametrize("slots", [1, 2, 5])
+def test_while_all_wait_all_have_equal_shares(site: "Site", hire: Hire, slots: int) -> None:
+    for count in (40, 20, 15):
+        upload(site, site.floors(count))
+    hire(slots)
+    admit(site)
+    served: Counter[str] = Counter()
+    for _ in range(30):
+        job = in_hand(site)[0]
+        served[job.organisation_id] += 1
+        end(site, job.id)
+    assert sum(served.values()) == 30
+    assert max(served.values()) - min(served.values()) <= 1
+
+
+def test_within_an_organisation_priority_comes_before_age(site: "Site", hire: Hire) -> None:
+    floors = site.floors(5)
+    rebuild, other_rebuild = upload(site, floors[:2])
+    low, normal, high = (ask(site, floor, p) for floor, p in zip(floors[2:], (LOW, NORMAL, HIGH), strict=True))
+    hire(1)
+    order = []
+    admit(site)
+    while jobs := in_hand(site):
+        order.append(jobs[0].id)
+        end(site, jobs[0].id)
+    assert order == [high, normal, rebuild, other_rebuild, low]
+
+
+def test_never_two_of_one_floor(site: "Site", hire: Hire) -> None:
+    hire(5)
+    floor = site.floor()
+    jobs = [*upload(site, [floor]), ask(site, floor, NORMAL), ask(site, floor, HIGH)]
+    assert [job.id for job in in_hand(site)] == [jobs[0]]
+    end(site, jobs[0])
+    assert [job.id for job in in_hand(site)] == [jobs[2]]
+
+
+def test_admissions_at_once_keep_to_the_slots(site: "Site", hire: Hire) -> None:
+    hire(2)
+    hire(1)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: upload(site, site.floors(3)), range(8)))
+        for _ in range(3):
+            now = [job.id for job in in_hand(site)]
+            assert len(now) == 3
+            list(pool.map(lambda job_id: end(site, job_id), now))
+
+
+def test_a_waiting_job_that_is_cancelled_makes_room(site: "Site", hire: Hire) -> None:
+    hire(1)
+    first, second = upload(site, site.floors(2))
+    assert site.cancel(first).status == "dismissed"
+    assert [job.id for job in in_hand(site)] == [second]
+
+
+def test_beside_a_worker_of_an_older_version_all_are_admitted(site: "Site", hire: Hire) -> None:
+    """It ends jobs without admitting the next."""
+    hire(1)
+    hire(None)
+    upload(site, site.floors(6))
+    assert len(in_hand(site)) == 6
+
+
+def test_a_job_that_an_older_version_enqueued_is_one_job(site: "Site", hire: Hire, engine: Engine) -> None:
+    (job_id,) = upload(site, [floor := site.floor()])
+    name = site.job(job_id).workflow_id
+    client = open_client(engine)
+    options = {"workflow_name": "rebuild", "workflow_id": name, "queue_name": QUEUE, "queue_partition_key": floor.id,
+               "app_version": APPLICATION_VERSION}  # fmt: skip
+    client.enqueue(options, floor.id, 1)
+    client.destroy()
+    hire(1)
+    admit(site)
+    assert known_to_the_engine(engine).count(name) == 1
+    with site.sessions.begin() as session:  # run by the older worker, it takes a slot though nobody admitted it
+        session.execute(update(Job).values(status="running", admitted_at=None))
+    upload(site, [site.floor()])
+    assert in_hand(site) == []
+
+
+def test_jobs_of_a_restored_database_are_admitted_anew(site: "Site", hire: Hire, queue: JobQueue) -> None:
+    hire(1)
+    (job_id,) = upload(site, [site.floor()])
+    hire(1)
+    with site.sessions.begin() as session:
+        queue.enqueue_again(session, session.get_one(Job, job_id))
+    assert in_hand(site) == []
+    admit(site)
+    assert [job.id for job in in_hand(site)] == [job_id]

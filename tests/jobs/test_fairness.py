@@ -1,0 +1,27 @@
+"""A real worker between organisations: the one with one walk is not kept waiting by the one with two hundred."""
+
+from typing import TYPE_CHECKING
+
+from sqlalchemy import select
+
+from app.db.tables import Floor, Job
+
+if TYPE_CHECKING:
+    from conftest import Crew, Site
+
+
+def test_two_hundred_waiting_floors_of_another_organisation_are_no_obstacle(crew: "Crew", site: "Site") -> None:
+    many = site.floors(200, sleep_s=0.2)
+    with site.sessions.begin() as session:
+        jobs = [site.queue.enqueue_rebuild(session, session.get_one(Floor, floor.id)).id for floor in many]
+    crew.environment["ISODYN_WORKER_PROCESSES"] = "1"
+    crew.hire()
+    site.wait(jobs[0], lambda _: len(crew.diary(event="fit ends")) > 0)
+    one = site.floor()
+    begun = len(crew.diary(event="fit starts"))
+    _, job_id = site.upload(one)
+    assert site.wait(job_id).status == "successful"
+    (number,) = [n for n, entry in enumerate(crew.diary(event="fit starts")) if entry["floor_id"] == one.id]
+    assert number - begun <= 1  # at most one that was admitted before it came
+    with site.sessions() as session:
+        assert len(session.scalars(select(Job.id).where(Job.status == "accepted")).all()) > 150

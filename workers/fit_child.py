@@ -1,0 +1,110 @@
+"""The child of `workers.fit_process`: takes orders for fits, one after the other, and answers them.
+
+A line of JSON on standard input is an order, the word `cancel` is for the fit that runs. Answers are lines of JSON on
+standard output: progress, and at the end a result or an error, with whether another order may come. A parent that dies
+closes the pipe, and the child ends.
+"""
+
+import json
+import logging
+import os
+import queue
+import resource
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from opentelemetry.context import attach
+
+from app.errors import IsodynError, JobCancelled, Unavailable
+from app.settings import Settings
+from app.telemetry.facts import add_facts
+from app.telemetry.logs import configure_logs
+from app.telemetry.tracing import configure_tracing, flush_traces, traced_from
+from workers.builder import load_builder
+
+__all__: list[str] = []
+
+ORPHANED = 4
+IDLE_S = 60.0  # then its memory is given back
+LARGEST_KEPT_KIB = 768 * 1024  # of its highest memory use: an allocator seldom gives back what a large fit took
+
+Progress = Callable[[float, str], None]
+
+
+class _Orders:
+    """What the parent says, heard by a thread of its own."""
+
+    def __init__(self) -> None:
+        self.cancelled = threading.Event()
+        self._waiting: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        threading.Thread(target=self._hear, daemon=True).start()
+
+    def next(self) -> dict[str, Any] | None:
+        """The next order; None when none has come for a while."""
+        try:
+            order = self._waiting.get(timeout=IDLE_S)
+        except queue.Empty:
+            return None
+        self.cancelled.clear()
+        return order
+
+    def _hear(self) -> None:
+        for line in sys.stdin:
+            if line.strip() == "cancel":
+                self.cancelled.set()
+            else:
+                self._waiting.put(json.loads(line))
+        os._exit(ORPHANED)
+
+
+def main() -> None:
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not look like an answer
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as is a service manager's, sent to all at once
+    os.nice(5)  # whoever asks for a position comes first
+    settings = Settings()
+    configure_logs(settings.log_format, settings.log_level)
+    configure_tracing(settings.otel, "isodyn-fit")
+    orders = _Orders()
+
+    def progress(fraction: float, message: str) -> None:
+        if orders.cancelled.is_set():
+            raise JobCancelled("the job was asked to stop")
+        answers.write(json.dumps({"fraction": fraction, "message": message}) + "\n")
+
+    kept = True
+    while kept and (order := orders.next()) is not None:
+        add_facts(**order.get("facts", {}))  # what it logs and traces belongs to the job that it works for
+        attach(traced_from(order.get("trace")))
+        answer = _answer(order, progress)
+        flush_traces()
+        kept = "result" in answer and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < LARGEST_KEPT_KIB
+        answers.write(json.dumps(answer | {"kept": kept}) + "\n")
+    answers.close()
+    os._exit(0)  # the thread that listens would be in the way of an orderly end
+
+
+def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    from threadpoolctl import threadpool_limits
+
+    from app.blobs import open_blob_store
+
+    try:
+        builder = load_builder(order["builder"])
+        with threadpool_limits(1):
+            return {"result": builder.fit_build(order["plan"], open_blob_store(order["blob_url"]), progress)}
+    except Unavailable as error:
+        logging.getLogger(__name__).warning("%s: %s", error, error.__cause__)
+        return {"unavailable": str(error)}
+    except IsodynError as error:
+        return {"error": str(error)}
+    except Exception as error:
+        logging.getLogger(__name__).exception("the fit failed")
+        return {"error": f"internal error in the fit ({type(error).__name__}: {error}); the worker's log has its trace"}
+
+
+if __name__ == "__main__":
+    main()
