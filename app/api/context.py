@@ -10,12 +10,13 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.api.bearer_tokens import BearerTokens
 from app.api.metrics import Metrics
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
 from app.services.follow import Follower
 from app.services.grid_cache import GridCache
-from app.services.manage_keys import KeyRing
+from app.services.key_ring import KeyRing
 from app.services.step_rate import StepRate
 from app.settings import Settings
 
@@ -38,6 +39,7 @@ class Context:
     grids: GridCache
     metrics: Metrics
     keys: KeyRing
+    tokens: BearerTokens | None
     searches: Executor
     follows: Executor
     follower: Follower

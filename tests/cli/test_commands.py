@@ -46,6 +46,7 @@ def test_every_command_explains_itself() -> None:
         "view",
         "evaluate",
         "keys",
+        "audit",
         "doctor",
         "openapi",
         "backup",

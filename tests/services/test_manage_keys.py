@@ -5,15 +5,16 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Key
-from app.services import manage_keys
-from app.services.manage_keys import KeyRing, create_key, revoke_key
+from app.services import key_ring
+from app.services.key_ring import KeyRing
+from app.services.manage_keys import create_key, revoke_key
 
 
 def test_a_revoked_key_is_forgotten_within_seconds(
     sessions: sessionmaker[Session], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
-    monkeypatch.setattr(manage_keys, "monotonic", lambda: now)
+    monkeypatch.setattr(key_ring, "monotonic", lambda: now)
     with sessions.begin() as session:
         secret = create_key(session, organisation="mine", name="robot", scopes=["locate"])
         key_id = session.scalars(select(Key.id).where(Key.name == "robot")).one()
@@ -27,6 +28,6 @@ def test_a_revoked_key_is_forgotten_within_seconds(
     with sessions.begin() as session:
         revoke_key(session, key_id)
     assert ring.recognise(secret) is None
-    now += manage_keys.RECENT_S
+    now += key_ring.RECENT_S
     assert ring.recent(secret) is None
     assert ring.recognise("isd_guess") is None
