@@ -23,6 +23,7 @@ from app.services.manage_keys import OPERATOR
 __all__ = [
     "AdminOfAll",
     "AdminOnly",
+    "BuildingMaking",
     "Calibrating",
     "CalibrationReading",
     "Identity",
@@ -35,7 +36,6 @@ __all__ = [
     "SurveyWriting",
     "TrackReading",
     "actor",
-    "check_unlimited",
     "recognised",
     "secret_of",
     "until_refused",
@@ -92,7 +92,8 @@ class _Needs:
     of a known key takes.
 
     any_of      scopes, of which one is needed
-    unlimited   what the endpoint is about, where that belongs to no building: not for keys limited to buildings
+    unlimited   why keys limited to buildings may not, where they may not
+    operator    for keys of the operator's organisation only
     """
 
     def __init__(self, *any_of: str, unlimited: str | None = None, operator: bool = False) -> None:
@@ -104,8 +105,8 @@ class _Needs:
         secret = None if credentials is None else credentials.credentials
         try:
             identity = await recognised(await context_of(request), secret, *self.any_of)
-            if self.unlimited is not None:
-                check_unlimited(identity, self.unlimited)
+            if self.unlimited is not None and identity.is_limited:
+                raise Forbidden(f"this key is limited to buildings, and {self.unlimited}; use one that is not")
             if self.operator and identity.organisation != OPERATOR:
                 raise Forbidden(f"this tells of all organisations: it needs a key of the organisation {OPERATOR}")
         except (Unauthorised, Forbidden) as error:
@@ -115,12 +116,6 @@ class _Needs:
         return identity
 
 
-def check_unlimited(identity: Identity, what: str) -> None:
-    """Raise Forbidden for a key that is limited to buildings."""
-    if identity.is_limited:
-        raise Forbidden(f"this key is limited to buildings, and {what}; use a key for the whole organisation")
-
-
 _OF_ALL = "calibrations belong to the whole organisation"
 AdminOnly = Annotated[Identity, Depends(_Needs("admin"))]
 AdminOfAll = Annotated[Identity, Depends(_Needs("admin", unlimited="the log tells of the whole organisation"))]
@@ -128,6 +123,7 @@ Monitoring = Annotated[
     Identity, Depends(_Needs("metrics", unlimited="metrics tell of the whole process", operator=True))
 ]
 Reading = Annotated[Identity, Depends(_Needs("map:read", "map:write"))]
+BuildingMaking = Annotated[Identity, Depends(_Needs("map:write", unlimited="a new building is not among them"))]
 MapWriting = Annotated[Identity, Depends(_Needs("map:write"))]
 SurveyReading = Annotated[Identity, Depends(_Needs("survey:write", "map:read", "map:write"))]
 SurveyWriting = Annotated[Identity, Depends(_Needs("survey:write"))]

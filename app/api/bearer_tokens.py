@@ -86,6 +86,8 @@ class BearerTokens:
         kind, kid = header.get("typ"), header.get("kid")
         if (kind.lower() if isinstance(kind, str) else kind) not in TYPES:
             raise ValueError(f"it is of type {str(kind)[:40]!r}")
+        if "crit" in header:
+            raise ValueError("its header has what must be understood, and is not")
         if header.get("alg") not in ALGORITHMS:  # before the issuer is asked for anything
             raise ValueError(f"algorithm {str(header.get('alg'))[:20]!r} is not taken")
         if not isinstance(kid, str) or not 1 <= len(kid) <= MOST_KID:

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic.config import JsonDict
 from sqlalchemy.orm import Session
 
-from app.api.auth import MapWriting, Reading, actor, check_unlimited
+from app.api.auth import BuildingMaking, MapWriting, Reading, actor
 from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
@@ -61,10 +61,8 @@ def show_building(row: Building) -> BuildingView:
 
 @router.post("/buildings", status_code=201, response_model=BuildingView, summary="Make a building")
 def create_building(
-    body: NewBuilding, request: Request, context: ContextDep, identity: MapWriting, key: IdempotencyKey = None
+    body: NewBuilding, request: Request, context: ContextDep, identity: BuildingMaking, key: IdempotencyKey = None
 ) -> Response:
-    check_unlimited(identity, "a new building is not among them")
-
     def create(session: Session) -> tuple[int, BaseModel]:
         row = Building(organisation_id=identity.organisation_id, name=body.name,
                        anchor=body.anchor.model_dump() if body.anchor else None)  # fmt: skip

@@ -1,7 +1,7 @@
 """The public keys of an OpenID Connect issuer, by its discovery document; asked for seldom, kept while it is away."""
 
 import logging
-from threading import Lock
+from threading import Event, Lock
 from time import monotonic
 from typing import Any
 
@@ -27,7 +27,8 @@ LEAST_RSA_BITS = 2048
 
 
 class IssuerKeys:
-    """Finds keys by their id. Safe to use from several threads: one fetches, and no other waits for it."""
+    """Finds keys by their id. Safe to use from several threads: one fetches, and but for the first time no other waits
+    for it."""
 
     def __init__(self, issuer: str) -> None:
         self._issuer = issuer
@@ -35,7 +36,7 @@ class IssuerKeys:
         self._fetched_at: float | None = None
         self._asked_at: float | None = None
         self._failed = False
-        self._asking = Lock()
+        self._asking, self._first = Lock(), Event()
 
     def find(self, kid: str) -> PublicKey | None:
         """The key of this id; the issuer is asked for one that is not known, unless it was asked a moment ago.
@@ -64,7 +65,7 @@ class IssuerKeys:
     def _ask(self) -> bool:
         """Fetch the keys, unless it is too early or another thread is about it; whether they were fetched."""
         if not self._asking.acquire(blocking=False):
-            return False
+            return not self._first.is_set() and self._first.wait(TIMEOUT_S) and not self._failed
         try:
             if self._wait_s() > 0.0:
                 return not self._failed
@@ -75,6 +76,7 @@ class IssuerKeys:
             _log.warning("the keys of %s could not be fetched; those known stay: %s", self._issuer, error)
         finally:
             self._asking.release()
+            self._first.set()
         return not self._failed
 
 
@@ -114,10 +116,10 @@ def _usable(told: Any) -> PublicKey | None:
         return None
     if told.get("kty") not in ("RSA", "EC", "OKP"):
         return None  # a shared secret above all
+    if told["kty"] == "RSA" and 6 * len(str(told.get("n"))) < LEAST_RSA_BITS:
+        return None
     try:
         key = JWKRegistry.import_key(told)
     except (JoseError, ValueError, TypeError, KeyError):
         return None
-    if isinstance(key, RSAKey):
-        return key if key.public_key.key_size >= LEAST_RSA_BITS else None
-    return key if isinstance(key, ECKey | OKPKey) else None
+    return key if isinstance(key, RSAKey | ECKey | OKPKey) else None

@@ -227,6 +227,7 @@ def _told_of(
     with context.transaction() as session:
         floor = find_own(session, identity, Floor, floor_id)
         if replaces is not None and not was_replaced(session, floor, replaces):
+            find_own(session, identity, Survey, replaces)
             find_replaced(session, floor, replaces)
         anchor = session.scalars(select(Building.anchor).where(Building.id == floor.building_id)).one()
         return _Told(
