@@ -109,7 +109,9 @@ class KeyRing:
         used, self._used = self._used, {}
         if used:
             with self._sessions.begin() as session:
-                session.connection().execute(_LAST_USED, [{"of": key_id, "now": at} for key_id, at in used.items()])
+                session.connection().execute(
+                    _LAST_USED, [{"of": key_id, "now": at} for key_id, at in list(used.items())]
+                )
 
 
 def recognise_key(session: Session, secret: str) -> Found | None:

@@ -2,11 +2,13 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
 
+from app.api import auth
 from app.services import key_ring
 
 
@@ -96,6 +98,24 @@ def test_a_revoked_key_is_useless(service: Any) -> None:
     ends(service, headers)
     (row,) = [each for each in service.http.get("/v1/keys?limit=200").json()["items"] if each["id"] == made["id"]]
     assert row["revoked_at"] is not None
+
+
+def test_events_of_a_job_end_with_the_key(
+    service: Any, new_floor: Callable[..., str], walk_csv: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(auth, "RECHECK_S", 0.2)
+    job = service.http.post(f"/v1/floors/{new_floor()}/surveys", content=walk_csv(1)).json()["job"]["id"]
+    made = make(service)
+    url, headers = f"/v1/jobs/{job}/events", headers_of(made["secret"])
+    with ThreadPoolExecutor(1) as pool:
+        events = pool.submit(service.http.get, url, headers=headers)
+        with pytest.raises(TimeoutError):
+            events.result(timeout=1.0)
+        service.http.delete(f"/v1/keys/{made['id']}")
+        told = events.result(timeout=30)
+    assert told.text.count("event: status") == 1
+    assert '"accepted"' in told.text
+    service.http.delete(f"/v1/jobs/{job}")
 
 
 def test_when_keys_were_used_is_written_down_apart(service: Any) -> None:

@@ -101,6 +101,17 @@ def test_the_grid_and_the_included_walks_are_those_stored(storage, grid_of, walk
     assert source.walks(Reach("north"), "f1-north", {}) == []
 
 
+def test_a_reach_of_other_buildings_finds_nothing(storage):
+    _, source = storage
+    elsewhere = Reach("north", frozenset({"b-south", "b-elsewhere"}))
+    assert source.buildings(elsewhere) == []
+    assert [each.id for each in source.buildings(Reach("north", frozenset({"b-north"})))] == ["b-north"]
+    for ask in (lambda: source.map(elsewhere, "m-north"), lambda: source.walks(elsewhere, "f0-north", {}),
+                lambda: source.plan_image(elsewhere, "f0-north")):  # fmt: skip
+        with pytest.raises(NotFound):
+            ask()
+
+
 def test_another_organisations_objects_are_not_found(storage):
     _, source = storage
     with pytest.raises(NotFound):
