@@ -30,12 +30,13 @@ __all__ = [
     "Locating",
     "MapWriting",
     "Measuring",
-    "Monitoring",
+    "Operating",
     "Reading",
     "SurveyReading",
     "SurveyWriting",
     "TrackReading",
     "actor",
+    "check_operator",
     "recognised",
     "secret_of",
     "until_refused",
@@ -93,7 +94,7 @@ class _Needs:
 
     any_of      scopes, of which one is needed
     unlimited   why keys limited to buildings may not, where they may not
-    operator    for keys of the operator's organisation only
+    operator    whether it takes a key of the operator's organisation (`check_operator`)
     """
 
     def __init__(self, *any_of: str, unlimited: str | None = None, operator: bool = False) -> None:
@@ -107,8 +108,8 @@ class _Needs:
             identity = await recognised(await context_of(request), secret, *self.any_of)
             if self.unlimited is not None and identity.is_limited:
                 raise Forbidden(f"this key is limited to buildings, and {self.unlimited}; use one that is not")
-            if self.operator and identity.organisation != OPERATOR:
-                raise Forbidden(f"this tells of all organisations: it needs a key of the organisation {OPERATOR}")
+            if self.operator:
+                check_operator(identity)
         except (Unauthorised, Forbidden) as error:
             where = None if request.client is None else request.client.host
             _log.info("refused %s %r from %s: %s", request.method, request.url.path, where, error)
@@ -116,12 +117,16 @@ class _Needs:
         return identity
 
 
+def check_operator(identity: Identity) -> None:
+    """Raise Forbidden but for a key of the organisation of whoever runs the installation, for what tells of all."""
+    if identity.is_limited or identity.organisation != OPERATOR:
+        raise Forbidden(f"this tells of all organisations: it needs a key for the whole organisation {OPERATOR}")
+
+
 _OF_ALL = "calibrations belong to the whole organisation"
 AdminOnly = Annotated[Identity, Depends(_Needs("admin"))]
 AdminOfAll = Annotated[Identity, Depends(_Needs("admin", unlimited="the log tells of the whole organisation"))]
-Monitoring = Annotated[
-    Identity, Depends(_Needs("metrics", unlimited="metrics tell of the whole process", operator=True))
-]
+Operating = Annotated[Identity, Depends(_Needs("admin", unlimited="this tells of all that is here", operator=True))]
 Reading = Annotated[Identity, Depends(_Needs("map:read", "map:write"))]
 BuildingMaking = Annotated[Identity, Depends(_Needs("map:write", unlimited="a new building is not among them"))]
 MapWriting = Annotated[Identity, Depends(_Needs("map:write"))]

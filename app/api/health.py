@@ -9,7 +9,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 from sqlalchemy import text
 
-from app.api.auth import Monitoring
+from app.api.auth import Operating
 from app.api.context import ContextDep
 from app.api.problems import ERROR_RESPONSES
 
@@ -57,8 +57,8 @@ def readyz(context: ContextDep) -> Response:
     response_class=Response,
     responses={**ERROR_RESPONSES, 200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-def metrics(context: ContextDep, _: Monitoring) -> Response:
-    """Of this process, whoever it served: for keys of the organisation `default`, with scope metrics or admin."""
+def metrics(context: ContextDep, _: Operating) -> Response:
+    """Of this process, whoever it served: for admin keys of the organisation `default`."""
     context.metrics.cached_bytes.set(context.grids.nbytes)
     context.metrics.cached_maps.set(len(context.grids))
     return Response(generate_latest(context.metrics.registry), media_type=CONTENT_TYPE_LATEST)

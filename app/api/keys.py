@@ -22,7 +22,7 @@ from app.services.manage_keys import MadeKey, make_key, revoke_key, rotate_key
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1/keys", tags=["keys"], responses=ERROR_RESPONSES)
-Scope = Literal["admin", "survey:write", "map:read", "map:write", "locate", "track:read", "metrics"]
+Scope = Literal["admin", "survey:write", "map:read", "map:write", "locate", "track:read"]
 BuildingId = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]
 
 
@@ -89,7 +89,7 @@ def list_keys(context: ContextDep, identity: AdminOnly, paging: PagingDep) -> Pa
 @router.post("", status_code=201, summary="Make a key")
 def create_key(body: NewKey, request: Request, context: ContextDep, identity: AdminOnly) -> MadeKeyView:
     """The answer holds the key itself, this once. An admin key that is limited to buildings makes keys that are limited
-    to some of them; scope `metrics` counts for keys of the organisation `default` alone."""
+    to some of them."""
     _check_no_wider(identity, body)
     with context.transaction() as session:
         owner = session.get_one(Organisation, identity.organisation_id)

@@ -26,7 +26,7 @@ __all__ = [
     "rotate_key",
 ]
 
-SCOPES = ("admin", "survey:write", "map:read", "map:write", "locate", "track:read", "metrics")
+SCOPES = ("admin", "survey:write", "map:read", "map:write", "locate", "track:read")
 OPERATOR = "default"
 """The organisation of whoever runs the installation: that of `ISODYN_ADMIN_KEY`."""
 OVERLAP = timedelta(hours=24)
