@@ -178,6 +178,7 @@ def keys() -> KeyRing:
     return KeyRing(
         {
             "north-key": Who(Reach("north"), frozenset({"map:read"})),
+            "barn-key": Who(Reach("north", frozenset({"barn"})), frozenset({"map:read"})),
             "south-key": Who(Reach("south"), frozenset({"admin"})),
             "locate-key": Who(Reach("north"), frozenset({"locate"})),
         }
