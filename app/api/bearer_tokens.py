@@ -4,7 +4,7 @@ import json
 import logging
 from base64 import urlsafe_b64decode
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeGuard
 
 from joserfc import jwt
 from joserfc.errors import JoseError
@@ -63,12 +63,12 @@ class BearerTokens:
         claims = jwt.decode(token, key, algorithms=ALGORITHMS, registry=self._registry).claims
         self._claims.validate(claims)
         subject, ends = claims["sub"], claims["exp"]
-        if not isinstance(subject, str) or not 1 <= len(subject) <= 255 or not subject.isprintable():
+        if not _is_name(subject, 255):
             raise ValueError("its subject is no name of at most 255 characters")
         if not 0 < ends < LATEST:
             raise ValueError("it ends at no time of the calendar")
         organisation = claims.get(self._settings.oidc_organisation_claim, self._settings.oidc_organisation)
-        if not isinstance(organisation, str):
+        if not _is_name(organisation, 200):
             raise ValueError(f"its claim {self._settings.oidc_organisation_claim} names no organisation")
         buildings = claims.get(self._settings.oidc_buildings_claim)
         return TokenClaims(
@@ -108,6 +108,10 @@ def _header(token: str) -> dict[str, Any]:
     if not isinstance(header, dict):
         raise ValueError("its header is no JSON object")
     return header
+
+
+def _is_name(told: object, longest: int) -> TypeGuard[str]:
+    return isinstance(told, str) and 1 <= len(told) <= longest and told.isprintable()
 
 
 def _words(told: object) -> frozenset[str]:

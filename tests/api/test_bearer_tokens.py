@@ -169,6 +169,7 @@ def forged(issuer: Issuer) -> dict[str, str]:
         "long subject": issuer.token(sub="a" * 256),
         "an organisation there is not": issuer.token(isodyn_organisation="nowhere"),
         "no organisation": issuer.token(isodyn_organisation=None),
+        "organisation is no name": issuer.token(isodyn_organisation="default\x00"),
         "organisation is a list": issuer.token(isodyn_organisation=["default"]),
         "buildings are numbers": issuer.token(isodyn_buildings=[1, 2]),
         "another type": issuer.token(header={"typ": "logout+jwt"}),
