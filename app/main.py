@@ -17,11 +17,13 @@ from threadpoolctl import threadpool_limits
 from app import __version__
 from app.api import (
     attitudes,
+    audit,
     buildings,
     calibrations,
     floors,
     health,
     jobs,
+    keys,
     localizability,
     locate,
     maps,
@@ -35,9 +37,11 @@ from app.api import (
     tracks,
 )
 from app.api.access_log import AccessLog
+from app.api.bearer_tokens import BearerTokens
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.problems import Problem, add_problem_handlers
+from app.api.upkeep import keep_up
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
@@ -45,7 +49,8 @@ from app.positioning.locate import warm_up
 from app.services.follow import Follower
 from app.services.follow_warm_up import warm_up_tracks
 from app.services.grid_cache import GridCache
-from app.services.manage_keys import KeyRing, ensure_admin_key
+from app.services.key_ring import KeyRing
+from app.services.manage_keys import ensure_admin_key
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
 from app.settings import Settings
@@ -85,6 +90,7 @@ def open_context(settings: Settings) -> Context:
     engine = create_database_engine(settings.resolved_database_url)
     blobs = open_blob_store(settings.resolved_blob_url)
     sessions = session_factory(engine)
+    tokens = None if settings.oidc_issuer is None else BearerTokens(settings)
     grids = GridCache(blobs, settings.grid_cache_bytes)
     follows = ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
     return Context(
@@ -94,7 +100,8 @@ def open_context(settings: Settings) -> Context:
         blobs=blobs,
         queue=JobQueue(engine),
         grids=grids,
-        keys=KeyRing(sessions),
+        keys=KeyRing(sessions, tokens),
+        tokens=tokens,
         searches=ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
         follows=follows,
         follower=Follower(
@@ -118,8 +125,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         Thread(target=_get_ready, name="warm-up", daemon=True).start()
         sweep = asyncio.create_task(_end_idle_tracks(context))
+        upkeep = asyncio.create_task(keep_up(context))
         yield
         sweep.cancel()
+        upkeep.cancel()
+        await run_in_threadpool(context.keys.note_uses)
         await viewer.close()
         await run_in_threadpool(context.follower.close)
         await run_in_threadpool(context.queue.close)
@@ -150,6 +160,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         calibrations,
         attitudes,
         jobs,
+        keys,
+        audit,
     ):
         app.include_router(part.router)
     for path in ("/", "/view"):

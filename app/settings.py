@@ -1,9 +1,9 @@
 """Settings, read once at the edge from `ISODYN_*` and passed on as values."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 __all__ = ["Settings"]
@@ -44,6 +44,19 @@ class Settings(BaseSettings):
         default=200.0, gt=0, description="most steps of one track a second, sustained; a minute of them at once"
     )
     track_cache_bytes: int = Field(default=512 * 2**20, description="memory for the states of tracks in use")
+    oidc_issuer: str | None = Field(
+        default=None, max_length=300, description="an OpenID Connect issuer whose bearer tokens are taken beside keys"
+    )
+    oidc_audience: str | None = Field(default=None, description="what such a token must name as its audience")
+    oidc_organisation_claim: str = Field(default="isodyn_organisation", description="claim that names the organisation")
+    oidc_organisation: str | None = Field(
+        default=None, description="organisation of tokens without that claim; default: they are refused"
+    )
+    oidc_scopes_claim: str = Field(default="scope", description="claim with the scopes: words, or a list")
+    oidc_buildings_claim: str = Field(
+        default="isodyn_buildings", description="claim with the buildings a token is limited to: words, or a list"
+    )
+    audit_days: int = Field(default=400, ge=1, description="days that rows of the audit log are kept")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
     trusted_proxies: str = Field(
         default="127.0.0.1,::1",
@@ -63,6 +76,12 @@ class Settings(BaseSettings):
     track_history_days: float | None = Field(
         default=None, ge=0, description="days that ended tracks stay; default: for ever"
     )
+
+    @model_validator(mode="after")
+    def _oidc_is_whole(self) -> Self:
+        if (self.oidc_issuer is None) != (self.oidc_audience is None):
+            raise ValueError("ISODYN_OIDC_ISSUER and ISODYN_OIDC_AUDIENCE go together: set both or neither")
+        return self
 
     @property
     def resolved_database_url(self) -> str:

@@ -24,6 +24,7 @@ from app.main import open_context
 from app.positioning.fix import LocateOptions
 from app.positioning.window import Window
 from app.services.locate_window import active_maps, locate_window
+from app.services.reach import Reach
 from app.settings import Settings
 
 KEY = "isd_benchmark"
@@ -100,7 +101,7 @@ def compare(port: int, folder: Path, ready_s: list[float]) -> int:
     context = open_context(settings)
     with context.engine.connect() as connection:
         organisation = connection.scalars(select(Organisation.id).where(Organisation.name == "default")).one()
-        maps = active_maps(connection, organisation, floor_ids=[floor])
+        maps = active_maps(connection, Reach(organisation), floor_ids=[floor])
 
     def in_process() -> object:
         return locate_window(maps, context.grids, window, composition="raw", techniques=("ml", "mlr", "abl"),

@@ -44,6 +44,7 @@ from app.positioning.locate import SearchableFloor, locate
 from app.positioning.window import Window
 from app.services.build_map import claim_build, fit_build, publish_build
 from app.services.locate_window import active_maps
+from app.services.reach import Reach
 from app.settings import Settings
 
 WIDTH_M, DEPTH_M = 60.0, 40.0
@@ -252,7 +253,7 @@ def make_floor(port: int, context: Context) -> str:
 def prepared(context: Context, floor: str) -> list[SearchableFloor]:
     with context.engine.connect() as connection:
         organisation = connection.scalars(select(Floor.organisation_id).where(Floor.id == floor)).one()
-        maps = active_maps(connection, organisation, floor_ids=[floor])
+        maps = active_maps(connection, Reach(organisation), floor_ids=[floor])
     return context.grids.searchable([(each.floor_id, each.grid_sha256) for each in maps])
 
 

@@ -170,7 +170,7 @@ def _estimate(context: Context, identity: Identity, body: AttitudeQuery) -> Atti
     with context.transaction() as session:
         calibration = find_calibration(session, identity.organisation_id, body.calibration_id, body.device)
     reference, told = find_reference(
-        context.sessions, context.grids, identity.organisation_id,
+        context.sessions, context.grids, identity.reach,
         AskedReference(
             asked.kind, asked.building_id, asked.floor_id, at, asked.position_sd_m, asked.horizontal_ut,
             asked.vertical_ut, asked.date or datetime.now(UTC).date(),

@@ -6,18 +6,18 @@ from typing import Annotated
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.config import JsonDict
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.api.auth import MapWriting, Reading
+from app.api.auth import BuildingMaking, MapWriting, Reading, actor
 from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Name, RequestModel, unchanged
-from app.api.ownership import find_own
+from app.api.ownership import find_own, own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Building
+from app.services.audit_log import record
 
 __all__ = ["router"]
 
@@ -61,13 +61,14 @@ def show_building(row: Building) -> BuildingView:
 
 @router.post("/buildings", status_code=201, response_model=BuildingView, summary="Make a building")
 def create_building(
-    body: NewBuilding, request: Request, context: ContextDep, identity: MapWriting, key: IdempotencyKey = None
+    body: NewBuilding, request: Request, context: ContextDep, identity: BuildingMaking, key: IdempotencyKey = None
 ) -> Response:
     def create(session: Session) -> tuple[int, BaseModel]:
         row = Building(organisation_id=identity.organisation_id, name=body.name,
                        anchor=body.anchor.model_dump() if body.anchor else None)  # fmt: skip
         session.add(row)
         session.flush()
+        record(session, actor(request, identity), "create", row)
         return 201, show_building(row)
 
     return answer_once(context, identity, request, key, body.model_dump_json().encode(), create)
@@ -76,8 +77,7 @@ def create_building(
 @router.get("/buildings", summary="List buildings")
 def list_buildings(context: ContextDep, identity: Reading, paging: PagingDep) -> Page[BuildingView]:
     with context.transaction() as session:
-        mine = select(Building).where(Building.organisation_id == identity.organisation_id)
-        return list_page(session, mine, Building.id, paging, show_building)
+        return list_page(session, own(identity, Building), Building.id, paging, show_building)
 
 
 @router.get("/buildings/{building_id}", response_model=BuildingView, summary="One building")
@@ -87,7 +87,9 @@ def get_building(building_id: Id, request: Request, context: ContextDep, identit
 
 
 @router.patch("/buildings/{building_id}", summary="Change a building's name or anchor")
-def patch_building(building_id: Id, body: BuildingPatch, context: ContextDep, identity: MapWriting) -> BuildingView:
+def patch_building(
+    building_id: Id, body: BuildingPatch, request: Request, context: ContextDep, identity: MapWriting
+) -> BuildingView:
     """What is not given stays. Outlines that came as longitude and latitude were put into building metres by the anchor
     of that time, and do not move with a new one: send them again."""
     with context.transaction() as session:
@@ -95,4 +97,5 @@ def patch_building(building_id: Id, body: BuildingPatch, context: ContextDep, id
         for name, value in body.model_dump(exclude_unset=True).items():
             setattr(row, name, value)
         session.flush()
+        record(session, actor(request, identity), "change", row, fields=sorted(body.model_fields_set))
         return show_building(row)

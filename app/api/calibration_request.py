@@ -6,10 +6,10 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from fastapi import Query
-from pydantic import AfterValidator, AwareDatetime, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from app.api.locate_request import FloorId, Quaternion, Vector
-from app.api.models import Finite, Name, Point, RequestModel
+from app.api.models import Finite, Name, Point, RequestModel, Time
 from app.services.calibrate import CIRCLE_METHODS, Asked, MappedWalk, Place
 
 __all__ = ["CalibrationId", "DeviceQuery", "Method", "NewCalibration"]
@@ -98,14 +98,6 @@ class WalkBody(RequestModel):
         return told
 
 
-def _in_utc(time: datetime | None) -> datetime | None:
-    """As it is kept. The first and the last hours of the calendar have no such time in some zones."""
-    try:
-        return None if time is None else time.astimezone(UTC)
-    except OverflowError:
-        raise ValueError("this time is off the calendar in UTC") from None
-
-
 class NewCalibration(RequestModel):
     model_config = ConfigDict(
         extra="forbid",
@@ -132,7 +124,7 @@ class NewCalibration(RequestModel):
     ]
     reference: ReferenceBody | None = None
     walk: WalkBody | None = None
-    measured_at: Annotated[AwareDatetime | None, AfterValidator(_in_utc), Field(description="default: now")] = None
+    measured_at: Annotated[Time | None, Field(description="default: now")] = None
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

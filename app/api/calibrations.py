@@ -9,18 +9,18 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.api.auth import Calibrating, Measuring
+from app.api.auth import Calibrating, CalibrationReading, actor
 from app.api.calibration_request import Method, NewCalibration
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once, answered_before
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Name
-from app.api.ownership import find_own
+from app.api.ownership import find_own, own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Calibration
+from app.services.audit_log import record
 from app.services.calibrate import calibrate
 from app.services.calibrations import compare_devices, device_drift, keep_readings, record_calibration
 
@@ -119,6 +119,7 @@ async def create_calibration(
             session, identity.organisation_id, device=body.device, fit=fit, reference=reference,
             samples_sha256=samples_sha256, measured_at=body.measured_at or datetime.now(UTC),
         )  # fmt: skip
+        record(session, actor(request, identity), "create", row, device=body.device)
         return 201, show_calibration(row)
 
     earlier = await run_in_threadpool(answered_before, context, identity, request, key, raw)
@@ -126,7 +127,7 @@ async def create_calibration(
         return earlier
     # A search of its own, so in turn with those for positions; it and its readings before the transaction.
     fit, reference, readings = await asyncio.get_running_loop().run_in_executor(
-        context.searches, calibrate, context.sessions, context.grids, identity.organisation_id, body.asked()
+        context.searches, calibrate, context.sessions, context.grids, identity.reach, body.asked()
     )
     samples_sha256 = await run_in_threadpool(keep_readings, context.blobs, readings)
     return await run_in_threadpool(partial(answer_once, context, identity, request, key, raw, create))
@@ -135,21 +136,21 @@ async def create_calibration(
 @router.get("/calibrations", summary="List calibrations")
 def list_calibrations(
     context: ContextDep,
-    identity: Measuring,
+    identity: CalibrationReading,
     paging: PagingDep,
     device: Annotated[Name | None, Query(description="of this device only")] = None,
 ) -> Page[CalibrationView]:
-    own = select(Calibration).where(Calibration.organisation_id == identity.organisation_id)
+    statement = own(identity, Calibration)
     if device is not None:
-        own = own.where(Calibration.device == device)
+        statement = statement.where(Calibration.device == device)
     with context.transaction() as session:
-        return list_page(session, own, Calibration.id, paging, show_calibration)
+        return list_page(session, statement, Calibration.id, paging, show_calibration)
 
 
 @router.get("/calibrations:drift", summary="How a device's calibrations change over time")
 def get_drift(
     context: ContextDep,
-    identity: Measuring,
+    identity: CalibrationReading,
     device: Annotated[Name, Query(examples=["robot-7"])],
     method: Annotated[Method | None, Query(description="default: that of its newest")] = None,
 ) -> DriftView:
@@ -162,7 +163,7 @@ def get_drift(
 @router.get("/calibrations:compare", summary="Are two devices equivalent, by their calibrations?")
 def get_comparison(
     context: ContextDep,
-    identity: Measuring,
+    identity: CalibrationReading,
     first_id: Annotated[str, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")],
     second_id: Annotated[str, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")],
     magnitude_ut: Annotated[Finite, Query(gt=1, le=200, description="of the field it is asked for")] = 50.0,
@@ -179,6 +180,6 @@ def get_comparison(
 
 
 @router.get("/calibrations/{calibration_id}", summary="One calibration")
-def get_calibration(calibration_id: Id, context: ContextDep, identity: Measuring) -> CalibrationView:
+def get_calibration(calibration_id: Id, context: ContextDep, identity: CalibrationReading) -> CalibrationView:
     with context.transaction() as session:
         return show_calibration(find_own(session, identity, Calibration, calibration_id))

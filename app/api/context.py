@@ -10,11 +10,12 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.api.bearer_tokens import BearerTokens
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
 from app.services.follow import Follower
 from app.services.grid_cache import GridCache
-from app.services.manage_keys import KeyRing
+from app.services.key_ring import KeyRing
 from app.services.step_rate import StepRate
 from app.settings import Settings
 
@@ -36,6 +37,7 @@ class Context:
     queue: JobQueue
     grids: GridCache
     keys: KeyRing
+    tokens: BearerTokens | None
     searches: Executor
     follows: Executor
     follower: Follower

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.api.auth import MapWriting, Reading
+from app.api.auth import MapWriting, Reading, actor
 from app.api.caching import pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
@@ -20,6 +20,7 @@ from app.db.tables import Building, Floor, Map, Survey
 from app.errors import Conflict
 from app.jobs.queue import lock_floor
 from app.outline.polygons import in_building, outline_of, read_polygons
+from app.services.audit_log import record
 
 __all__ = ["FloorView", "router", "show_floor"]
 
@@ -130,6 +131,7 @@ def create_floor(
                     **body.model_dump(exclude={"outline"}), outline=_read_outline(body.outline))  # fmt: skip
         session.add(row)
         session.flush()
+        record(session, actor(request, identity), "create", row, building_id=building.id)
         return 201, show_floor(row)
 
     return answer_once(context, identity, request, key, raw, create)
@@ -149,7 +151,9 @@ def get_floor(floor_id: Id, request: Request, context: ContextDep, identity: Rea
 
 
 @router.patch("/floors/{floor_id}", summary="Change a floor")
-def patch_floor(floor_id: Id, body: FloorPatch, context: ContextDep, identity: MapWriting) -> FloorView:
+def patch_floor(
+    floor_id: Id, body: FloorPatch, request: Request, context: ContextDep, identity: MapWriting
+) -> FloorView:
     """What is not given stays; null removes `height_m` or `outline`, and is refused elsewhere.
 
     `elevation_m` changes only while the floor has neither surveys nor maps (409): samples and grids are stored with z
@@ -168,6 +172,7 @@ def patch_floor(floor_id: Id, body: FloorPatch, context: ContextDep, identity: M
         for name, value in changes.items():
             setattr(row, name, value)
         session.flush()
+        record(session, actor(request, identity), "change", row, fields=sorted(body.model_fields_set))
         return show_floor(row)
 
 

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.api.context import Context
 from app.db.tables import Idempotency
 from app.errors import Conflict
-from app.services.manage_keys import Identity
+from app.services.key_ring import Identity
 
 __all__ = ["IdempotencyKey", "RawBody", "answer_once", "answered_before"]
 
@@ -47,6 +47,7 @@ def answer_once(
 
     Raises Conflict when the key was used for a different request.
     """
+    key = _within_reach(identity, key)
     fingerprint = _fingerprint(request, body)
     for attempt in (1, 2):
         try:
@@ -82,11 +83,21 @@ def answered_before(
 
     Raises Conflict when the key was used for a different request.
     """
+    key = _within_reach(identity, key)
     if key is None:
         return None
     with context.transaction() as session:
         earlier = session.get(Idempotency, (identity.organisation_id, key))
         return None if earlier is None else _again(earlier, _fingerprint(request, body))
+
+
+def _within_reach(identity: Identity, key: str | None) -> str | None:
+    """What an answer is kept under. Keys limited to buildings have names of their own: an answer that was given to
+    somebody who reaches further is not for them."""
+    within = identity.reach.building_ids
+    if key is None or within is None:
+        return key
+    return sha256("\n".join([key, *sorted(within)]).encode()).hexdigest()
 
 
 def _fingerprint(request: Request, body: bytes) -> str:

@@ -9,16 +9,16 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
-from sqlalchemy import select
 from sse_starlette import EventSourceResponse
 
-from app.api.auth import MapWriting, SurveyReading
+from app.api.auth import MapWriting, SurveyReading, actor, secret_of, until_refused
 from app.api.context import ContextDep
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Id
-from app.api.ownership import find_own
+from app.api.ownership import find_own, own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Job
+from app.services.audit_log import record
 
 __all__ = ["JobView", "router", "show_job"]
 
@@ -61,7 +61,7 @@ def list_jobs(
     status: Annotated[JobStatus | None, Query()] = None,
     floor_id: Annotated[str | None, Query(max_length=64, pattern=r"^[A-Za-z0-9_-]+$")] = None,
 ) -> Page[JobView]:
-    statement = select(Job).where(Job.organisation_id == identity.organisation_id)
+    statement = own(identity, Job)
     if status is not None:
         statement = statement.where(Job.status == status)
     if floor_id is not None:
@@ -77,12 +77,13 @@ def get_job(job_id: Id, context: ContextDep, identity: SurveyReading) -> JobView
 
 
 @router.delete("/{job_id}", summary="Cancel a job")
-def cancel_job(job_id: Id, context: ContextDep, identity: MapWriting) -> JobView:
+def cancel_job(job_id: Id, request: Request, context: ContextDep, identity: MapWriting) -> JobView:
     """A waiting job is dismissed at once; a running one when it next reports progress; an ended one stays as it is."""
     with context.transaction() as session:
         job = find_own(session, identity, Job, job_id)
         if job.status not in FINAL:
             context.queue.request_cancel(session, job)
+            record(session, actor(request, identity), "cancel", job, floor_id=job.floor_id)
         return show_job(job)
 
 
@@ -93,7 +94,7 @@ def cancel_job(job_id: Id, context: ContextDep, identity: MapWriting) -> JobView
     responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}}},
 )
 async def job_events(job_id: Id, request: Request, context: ContextDep, identity: SurveyReading) -> EventSourceResponse:
-    """One `status` event whenever the status changes, the last one when the job has ended."""
+    """One `status` event whenever the status changes, the last one when the job has ended. Ends with the key, too."""
 
     def read() -> JobView:
         with context.transaction() as session:
@@ -103,14 +104,18 @@ async def job_events(job_id: Id, request: Request, context: ContextDep, identity
 
     async def events() -> AsyncIterator[dict[str, str]]:
         view, sent = first, None
-        while True:
-            content = view.model_dump(mode="json")
-            if content != sent:
-                sent = content
-                yield {"event": "status", "data": json.dumps(content)}
-            if view.status in FINAL or await request.is_disconnected():
-                return
-            await asyncio.sleep(0.5)
-            view = await run_in_threadpool(read)
+        refused = asyncio.create_task(until_refused(context, secret_of(request)))
+        try:
+            while not refused.done():
+                content = view.model_dump(mode="json")
+                if content != sent:
+                    sent = content
+                    yield {"event": "status", "data": json.dumps(content)}
+                if view.status in FINAL or await request.is_disconnected():
+                    return
+                await asyncio.sleep(0.5)
+                view = await run_in_threadpool(read)
+        finally:
+            refused.cancel()
 
     return EventSourceResponse(events())

@@ -95,11 +95,11 @@ def _json(answer: BaseModel) -> Response:
 
 def _building_maps(context: Context, identity: Identity, building_id: str, body: LocateBody) -> list[ActiveMap]:
     with context.engine.connect() as connection:
-        maps = active_maps(connection, identity.organisation_id, building_id=building_id, floor_ids=body.floor_ids)
-        if not maps and connection.scalars(
-            select(Building.id).where(Building.id == building_id, Building.organisation_id == identity.organisation_id)
-        ).first() is None:  # fmt: skip
-            raise NotFound(f"no building {building_id}")
+        maps = active_maps(connection, identity.reach, building_id=building_id, floor_ids=body.floor_ids)
+        if not maps:
+            owner = connection.scalars(select(Building.organisation_id).where(Building.id == building_id)).first()
+            if owner is None or not identity.reach.holds(owner, building_id):
+                raise NotFound(f"no building {building_id}")
     return maps
 
 
@@ -107,7 +107,7 @@ def _floor_maps(context: Context, identity: Identity, floor_id: str, body: Locat
     if body.floor_ids is not None and body.floor_ids != [floor_id]:
         raise InvalidInput("floor_ids is for buildings", Fault("/body/floor_ids", "leave it out on a floor"))
     with context.engine.connect() as connection:
-        return active_maps(connection, identity.organisation_id, floor_ids=[floor_id])
+        return active_maps(connection, identity.reach, floor_ids=[floor_id])
 
 
 def _calibration(context: Context, identity: Identity, body: LocateBody) -> AppliedCalibration | None:

@@ -14,7 +14,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from app import __version__
-from app.api.auth import Identity, MapWriting, Reading
+from app.api.auth import Identity, MapWriting, Reading, actor
 from app.api.caching import immutable, pointer
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
@@ -32,6 +32,7 @@ from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_
 from app.field.spec import Kernel, MapSpec, Noise
 from app.jobs.admission import HIGH, LOW, NORMAL
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
+from app.services.audit_log import ACCEPTED, record
 from app.services.exact_limit import TOO_MANY, outgrow_exact
 from app.services.export_map import EXTENSIONS, MEDIA_TYPES, ExportFormat, export_map
 from app.viewer.layers import check_layer, nearest_height
@@ -234,6 +235,7 @@ def create_map(
         session.add(row)
         session.flush()
         job = context.queue.enqueue_build(session, row, PRIORITIES[body.priority])
+        record(session, actor(request, identity), "build", row, ACCEPTED, floor_id=floor.id, job_id=job.id)
         return 202, NewMapAnswer(map=show_map(row, floor.active_map_id), job=show_job(job))
 
     return answer_once(context, identity, request, key, body.model_dump_json().encode(), create)
@@ -255,7 +257,7 @@ def get_map(map_id: Id, request: Request, context: ContextDep, identity: Reading
 
 
 @router.post("/maps/{map_id}/activate", summary="Answer with this map from now on")
-def activate_map(map_id: Id, context: ContextDep, identity: MapWriting) -> MapView:
+def activate_map(map_id: Id, request: Request, context: ContextDep, identity: MapWriting) -> MapView:
     """Moves one pointer; works on any finished map of the floor, so it also rolls back."""
     with context.transaction() as session:
         row = find_own(session, identity, Map, map_id)
@@ -266,6 +268,7 @@ def activate_map(map_id: Id, context: ContextDep, identity: MapWriting) -> MapVi
             .where(Floor.id == row.floor_id)
             .values(active_map_id=row.id, active_sequence=Floor.build_sequence)
         )
+        record(session, actor(request, identity), "activate", row, floor_id=row.floor_id)
         return show_map(row, row.id)
 
 

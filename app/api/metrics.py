@@ -8,7 +8,7 @@ from fastapi.security import HTTPAuthorizationCredentials
 from prometheus_client import REGISTRY, CollectorRegistry, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-from app.api.auth import bearer, recognised
+from app.api.auth import bearer, check_operator, recognised
 from app.api.context import ContextDep
 from app.api.problems import ERROR_RESPONSES
 from app.services.installation_metrics import InstallationMetrics
@@ -21,12 +21,13 @@ router = APIRouter(tags=["operations"])
 async def _may_read(
     request: Request, context: ContextDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
 ) -> None:
-    """The key of ISODYN_METRICS_KEY, or an admin's."""
+    """The key of ISODYN_METRICS_KEY, or an admin's of whoever runs the installation."""
     secret = None if credentials is None else credentials.credentials
     wanted = context.settings.metrics_key
     if secret is not None and wanted is not None and compare_digest(secret.encode(), wanted.encode()):
         return
     request.state.identity = await recognised(context, secret, "admin")
+    check_operator(request.state.identity)
 
 
 @router.get(

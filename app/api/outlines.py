@@ -6,7 +6,7 @@ from fastapi import APIRouter, Body, Query, Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
-from app.api.auth import MapWriting
+from app.api.auth import MapWriting, actor
 from app.api.context import ContextDep
 from app.api.floors import FloorView, show_floor
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
@@ -18,6 +18,7 @@ from app.errors import Conflict
 from app.geodesy import Anchor
 from app.outline.levels import read_levels, read_outline
 from app.outline.polygons import Place, in_building, on_earth
+from app.services.audit_log import record
 from app.services.import_floors import import_floors
 
 __all__ = ["router"]
@@ -71,7 +72,12 @@ class ImportView(BaseModel):
     summary="Give a floor its outline",
 )
 def put_outline(
-    floor_id: Id, body: GeoJson, context: ContextDep, identity: MapWriting, coordinates: Coordinates = "building"
+    floor_id: Id,
+    body: GeoJson,
+    request: Request,
+    context: ContextDep,
+    identity: MapWriting,
+    coordinates: Coordinates = "building",
 ) -> FloorView:
     """A GeoJSON Polygon, MultiPolygon, Feature, or the FeatureCollection of an indoor map (IMDF), of which the level
     whose `properties.ordinal` is the floor's own is taken; several of that ordinal are taken together.
@@ -83,6 +89,7 @@ def put_outline(
         place = _place(session.get_one(Building, floor.building_id), coordinates)
         floor.outline = read_outline(body, "/body", place, floor.ordinal)
         session.flush()
+        record(session, actor(request, identity), "change", floor, fields=["outline"])
         return show_floor(floor)
 
 
@@ -110,6 +117,8 @@ def post_import(
         building = find_own(session, identity, Building, building_id)
         levels = read_levels(body, "/body", _place(building, coordinates))
         imported = import_floors(session, building, levels, storey_height_m)
+        record(session, actor(request, identity), "import", building, made=[floor.id for floor in imported.made],
+               changed=[floor.id for floor in imported.changed])  # fmt: skip
         return 200, ImportView(
             made=[show_floor(floor) for floor in imported.made],
             changed=[show_floor(floor) for floor in imported.changed],

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from app.api.auth import Identity, MapWriting, Reading
+from app.api.auth import Identity, MapWriting, Reading, actor
 from app.api.body import read_upload
 from app.api.caching import changing
 from app.api.context import Context, ContextDep
@@ -16,6 +16,7 @@ from app.api.ownership import find_own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Floor
 from app.errors import NotFound
+from app.services.audit_log import record
 from app.services.receive_plan import MAX_PLAN_BYTES, Placement, Plan, place_plan
 
 __all__ = ["router"]
@@ -61,7 +62,7 @@ async def put_plan(
 
     def receive() -> FloorView:
         plan = place_plan(context.blobs, data, placement)
-        return _point_to(context, identity, floor_id, plan)
+        return _point_to(context, request, identity, floor_id, plan)
 
     return await run_in_threadpool(receive)
 
@@ -84,9 +85,9 @@ def get_plan(floor_id: Id, request: Request, context: ContextDep, identity: Read
 
 
 @router.delete("/floors/{floor_id}/plan", status_code=204, summary="Take a floor's plan away")
-def delete_plan(floor_id: Id, context: ContextDep, identity: MapWriting) -> Response:
+def delete_plan(floor_id: Id, request: Request, context: ContextDep, identity: MapWriting) -> Response:
     """Also answers 204 where there is none."""
-    _point_to(context, identity, floor_id, None)
+    _point_to(context, request, identity, floor_id, None)
     return Response(status_code=204)
 
 
@@ -96,9 +97,10 @@ def _check_floor(context: Context, identity: Identity, floor_id: str) -> None:
         find_own(session, identity, Floor, floor_id)
 
 
-def _point_to(context: Context, identity: Identity, floor_id: str, plan: Plan | None) -> FloorView:
+def _point_to(context: Context, request: Request, identity: Identity, floor_id: str, plan: Plan | None) -> FloorView:
     with context.transaction() as session:
         floor = find_own(session, identity, Floor, floor_id)
         floor.plan = plan.as_row() if plan else None
         session.flush()
+        record(session, actor(request, identity), "change", floor, fields=["plan"])
         return show_floor(floor)

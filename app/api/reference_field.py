@@ -75,7 +75,7 @@ def get_reference_field(
             reason = "give a building_id or a latitude and longitude, not both"
             raise InvalidInput(reason, Fault("/query/building_id", reason))
         with context.transaction() as session:
-            field, anchor = earth_at_building(session, identity.organisation_id, building_id, on, "/query/building_id")
+            field, anchor = earth_at_building(session, identity.reach, building_id, on, "/query/building_id")
         return show_reference_field(field, anchor, in_building=True)
     if latitude_deg is None or longitude_deg is None:
         reason = "say where: latitude_deg and longitude_deg, or building_id"

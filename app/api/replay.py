@@ -99,7 +99,7 @@ def _floor_and_maps(
     """The floor's elevation and its active map, and the device's calibration. Raises NotFound, Conflict."""
     with context.transaction() as session:
         elevation_m = find_own(session, identity, Floor, floor_id).elevation_m
-        maps = active_maps(session.connection(), identity.organisation_id, floor_ids=[floor_id])
+        maps = active_maps(session.connection(), identity.reach, floor_ids=[floor_id])
         calibration = find_calibration(session, identity.organisation_id, calibration_id, device)
     if not maps:
         raise Conflict(f"floor {floor_id} has no map yet; upload surveys and wait for its job")

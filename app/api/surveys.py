@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.api.auth import Identity, SurveyReading, SurveyWriting
+from app.api.auth import Identity, SurveyReading, SurveyWriting, actor
 from app.api.body import read_upload
 from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
@@ -27,6 +27,7 @@ from app.field.spec import ChangePoint, ComponentConsistency, SegmentConsistency
 from app.geodesy import Anchor
 from app.jobs.queue import lock_floor
 from app.services.artefacts import samples_from_bytes
+from app.services.audit_log import ACCEPTED, DONE, record
 from app.services.calibrations import AppliedCalibration, find_calibration
 from app.services.disturbances import checked_stretches, union_s
 from app.services.receive_survey import find_replaced, parse_survey, record_survey, was_replaced
@@ -203,6 +204,9 @@ async def upload_survey(
             floor = find_own(transaction, identity, Floor, floor_id)
             survey, job, new = record_survey(transaction, context.queue, floor, parsed, replaces)
             UPLOADS.labels("new" if new else "known").inc()
+            if new:
+                record(transaction, actor(request, identity), "upload", survey, ACCEPTED if job else DONE,
+                       floor_id=floor.id, replaces=replaces, job_id=job.id if job else None)  # fmt: skip
             view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
             return 202 if new else 200, view
 
@@ -228,6 +232,7 @@ def _told_of(
     with context.transaction() as session:
         floor = find_own(session, identity, Floor, floor_id)
         if replaces is not None and not was_replaced(session, floor, replaces):
+            find_own(session, identity, Survey, replaces)
             find_replaced(session, floor, replaces)
         anchor = session.scalars(select(Building.anchor).where(Building.id == floor.building_id)).one()
         return _Told(
@@ -365,7 +370,9 @@ def get_samples(
 
 
 @router.patch("/surveys/{survey_id}", summary="Leave a survey out of maps, or take it in again")
-def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity: SurveyWriting) -> PatchedSurvey:
+def patch_survey(
+    survey_id: Id, body: SurveyPatch, request: Request, context: ContextDep, identity: SurveyWriting
+) -> PatchedSurvey:
     disturbed = []
     if "exclude_disturbed" in body.model_fields_set:
         disturbed = [[each.start_s, each.end_s] for each in _disturbances(context, identity, survey_id).stretches]
@@ -381,13 +388,17 @@ def patch_survey(survey_id: Id, body: SurveyPatch, context: ContextDep, identity
         changed = before != (survey.included, survey.excluded_s or []) and (before[0] or survey.included)
         session.flush()
         job = _rebuild(session, context, survey.floor_id) if changed else None
+        record(
+            session, actor(request, identity), "change", survey, ACCEPTED if job else DONE,
+            fields=sorted(body.model_fields_set), included=survey.included, job_id=job.id if job else None,
+        )  # fmt: skip
         return PatchedSurvey(**show_survey(survey).model_dump(), job=show_job(job) if job else None)
 
 
 @router.delete(
     "/surveys/{survey_id}", status_code=204, responses={204: {"headers": _JOB_LINK}}, summary="Delete a survey"
 )
-def delete_survey(survey_id: Id, context: ContextDep, identity: SurveyWriting) -> Response:
+def delete_survey(survey_id: Id, request: Request, context: ContextDep, identity: SurveyWriting) -> Response:
     """Maps already built keep what they learned from it; the next build does not have it.
 
     The header `Link` names the job of the rebuild that it set off, when there is one.
@@ -398,6 +409,8 @@ def delete_survey(survey_id: Id, context: ContextDep, identity: SurveyWriting) -
         session.delete(survey)
         session.flush()
         job = _rebuild(session, context, floor_id)
+        record(session, actor(request, identity), "delete", survey, ACCEPTED if job else DONE, floor_id=floor_id,
+               job_id=job.id if job else None)  # fmt: skip
         headers = {"Link": f'</v1/jobs/{job.id}>; rel="monitor"'} if job else {}
     return Response(status_code=204, headers=headers)
 

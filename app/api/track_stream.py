@@ -3,7 +3,7 @@
 The first message says which number is waited for, so that a client that lost its connection goes on from there. What
 has arrived while a batch was followed is the next batch: a fast device is answered less often, never late. Reading
 stops while too much waits, and TCP then slows the sender down. Several connections to one track take turns, batch by
-batch; a step that both send is a duplicate to one of them.
+batch; a step that both send is a duplicate to one of them. A stream ends with its key, whether steps come or not.
 
 A message of ours is `{"type": "ready" | "estimate" | "problem", ...}`; of the client's `{"type": "steps", "steps":
 [...], "flush"?}`, or a single step `{"type": "step", "number", ...}`.
@@ -21,7 +21,7 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 from sqlalchemy.exc import OperationalError
 
-from app.api.auth import Identity, recognised
+from app.api.auth import Identity, recognised, secret_of, until_refused
 from app.api.context import Context
 from app.api.problems import Forbidden, Unauthorised, isodyn_problem, problem_response, validation_problem
 from app.api.track_answer import steps_answer
@@ -71,9 +71,9 @@ async def stream(browser: WebSocket, track_id: str) -> None:
 
 def _secret(browser: WebSocket) -> str | None:
     """The key: of `Authorization`, or of the subprotocol `bearer.<key>`, which is what browsers can send."""
-    scheme, _, key = browser.headers.get("authorization", "").partition(" ")
-    if scheme.lower() == "bearer" and key:
-        return key.strip()
+    secret = secret_of(browser)
+    if secret is not None:
+        return secret
     offered = [each for each in browser.scope.get("subprotocols", ()) if each.startswith(BEARER)]
     return offered[0].removeprefix(BEARER) if offered else None
 
@@ -87,7 +87,7 @@ def _check_origin(browser: WebSocket) -> None:
 
 def _ready(context: Context, identity: Identity, track_id: str) -> tuple[StepKind, dict[str, Any]]:
     """What the track's steps are, and the first message. Raises NotFound, Conflict."""
-    live = context.follower.live(track_id, identity.organisation_id)
+    live = context.follower.live(track_id, identity.reach)
     context.follower.check_active(live)
     return live.kind, {
         "type": "ready", "track_id": track_id, "status": "active", "frame": live.kind.frame,
@@ -104,20 +104,29 @@ class _Stream:
         self._read: asyncio.Queue[str | bytes | None] = asyncio.Queue()
         self._ahead_bytes, self._room = 0, asyncio.Event()
         self._gone = False
+        self._refused: IsodynError | None = None
 
     async def run(self, ready: dict[str, Any]) -> None:
         await self._send(ready)
-        reading = asyncio.create_task(self._read_on())
+        tasks = asyncio.create_task(self._read_on()), asyncio.create_task(self._watch())
         try:
             while not self._gone and (first := await self._read.get()) is not None:
                 if not await self._answer(self._with_waiting(first)):
                     return
+            if self._refused is not None:
+                await self._refuse(self._refused)
         except (WebSocketDisconnect, RuntimeError, asyncio.CancelledError):
             return  # gone, or the server stops, while it was answered: what was followed is stored
         finally:
-            reading.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await reading
+            for task in tasks:
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await task
+
+    async def _watch(self) -> None:
+        """Until the key has ended; then so does the stream, after the batch in work."""
+        self._refused = await until_refused(self._context, self._secret, "locate")
+        await self._read.put(None)
 
     async def _read_on(self) -> None:
         """Until the client goes; waits while too much is read ahead, and the client with it."""
@@ -170,7 +179,7 @@ class _Stream:
             steps = [step for message in messages for step in message.steps]
             await self._slow_down(len(steps))
             outcome = await self._context.follower.follow(
-                self._track_id, identity.organisation_id, steps, any(message.flush for message in messages)
+                self._track_id, identity.reach, steps, any(message.flush for message in messages)
             )
         except InvalidInput as error:
             if len(messages) > 1:
@@ -178,8 +187,7 @@ class _Stream:
             await self._problem(isodyn_problem(error))
             return True
         except IsodynError as error:
-            await self._problem(isodyn_problem(error))
-            await self._browser.close(next((code for kind, code in _CLOSES.items() if isinstance(error, kind)), 1011))
+            await self._refuse(error)
             return False
         except OperationalError:
             detail = "the database cannot be reached now; nothing was stored, connect again and send it again"
@@ -193,6 +201,10 @@ class _Stream:
         """A stream that is faster than it may be waits."""
         while (wait_s := self._context.step_rate.take(self._track_id, steps)) > 0.0:
             await asyncio.sleep(min(wait_s, 1.0))
+
+    async def _refuse(self, error: IsodynError) -> None:
+        await self._problem(isodyn_problem(error))
+        await self._browser.close(next((code for kind, code in _CLOSES.items() if isinstance(error, kind)), 1011))
 
     async def _problem(self, answer: Any) -> None:
         await self._send({"type": "problem", "problem": msgspec.json.decode(bytes(answer.body))})

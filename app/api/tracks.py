@@ -15,13 +15,13 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app import __version__
-from app.api.auth import Identity, Locating
+from app.api.auth import Identity, Locating, TrackReading, actor
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
 from app.api.listing import Page, PagingDep, list_page
 from app.api.locate_request import FloorId
 from app.api.models import Id
-from app.api.ownership import find_own
+from app.api.ownership import find_own, own
 from app.api.problems import ERROR_RESPONSES, TOO_MANY
 from app.api.track_answer import (
     EstimateView,
@@ -40,6 +40,7 @@ from app.api.track_ground import read_ground
 from app.api.track_request import NewTrack, StepsBody, core_options, core_prior, raw_steps
 from app.db.tables import Building, Floor, Track, TrackSteps
 from app.errors import Conflict, Fault, InvalidInput, TooMany
+from app.services.audit_log import record
 from app.services.calibrations import find_calibration
 from app.services.estimate_attitude import check_vector, earth_as_reference
 from app.services.locate_window import ActiveMap, active_maps
@@ -79,6 +80,7 @@ def create_track(
         check_walkable(context.follower.trackers.make(row.spec, row.frame, row.seed))
         session.add(row)
         session.flush()
+        record(session, actor(request, identity), "create", row, building_id=row.building_id)
         return 201, _detail(context, row, SEARCHING)
 
     return answer_once(context, identity, request, key, raw, create)
@@ -97,7 +99,7 @@ def _attitude(
     if kind != "wmm":
         return {"reference": kind}
     today = datetime.now(UTC).date()
-    return {"reference": kind} | earth_as_reference(session, identity.organisation_id, floor.building_id, None, today)
+    return {"reference": kind} | earth_as_reference(session, identity.reach, floor.building_id, None, today)
 
 
 def _check_count(session: Session, context: Context, identity: Identity) -> None:
@@ -119,9 +121,7 @@ def _floors_and_maps(session: Session, identity: Identity, body: NewTrack) -> tu
     """The floors asked for that have a map, by id, and their maps. Raises NotFound, Conflict, InvalidInput."""
     if body.building_id is not None:
         find_own(session, identity, Building, body.building_id)
-    maps = active_maps(
-        session.connection(), identity.organisation_id, building_id=body.building_id, floor_ids=body.floor_ids
-    )
+    maps = active_maps(session.connection(), identity.reach, building_id=body.building_id, floor_ids=body.floor_ids)
     mapped = [each.floor_id for each in maps]
     if bare := [floor_id for floor_id in body.floor_ids or () if floor_id not in mapped]:
         raise Conflict(f"floor {bare[0]} has no map yet; upload surveys and wait for its job, or leave it out")
@@ -137,12 +137,12 @@ def _floors_and_maps(session: Session, identity: Identity, body: NewTrack) -> tu
 @router.get("", summary="List tracks")
 def list_tracks(
     context: ContextDep,
-    identity: Locating,
+    identity: TrackReading,
     paging: PagingDep,
     building_id: Annotated[FloorId | None, Query()] = None,
     status: Annotated[Literal["active", "ended"] | None, Query()] = None,
 ) -> Page[TrackView]:
-    statement = select(Track).where(Track.organisation_id == identity.organisation_id)
+    statement = own(identity, Track)
     if building_id is not None:
         statement = statement.where(Track.building_id == building_id)
     idle = (Track.status == "ended") | (Track.touched_at < context.follower.idle_before)
@@ -153,7 +153,7 @@ def list_tracks(
 
 
 @router.get("/{track_id}", summary="One track, with its last estimate")
-def get_track(track_id: Id, context: ContextDep, identity: Locating) -> TrackDetail:
+def get_track(track_id: Id, context: ContextDep, identity: TrackReading) -> TrackDetail:
     with context.transaction() as session:
         row = find_own(session, identity, Track, track_id)
     last = next(batches_of(context.sessions, row.id, max(row.batches - 1, 0), row.batches), None)
@@ -161,19 +161,22 @@ def get_track(track_id: Id, context: ContextDep, identity: Locating) -> TrackDet
 
 
 @router.delete("/{track_id}", status_code=204, summary="End a track and remove all of it")
-def remove_track(track_id: Id, context: ContextDep, identity: Locating) -> None:
+def remove_track(track_id: Id, request: Request, context: ContextDep, identity: Locating) -> None:
     with context.transaction() as session:
-        delete_track(session, find_own(session, identity, Track, track_id).id)
+        row = find_own(session, identity, Track, track_id)
+        record(session, actor(request, identity), "delete", row, building_id=row.building_id)
+        delete_track(session, row.id)
     context.follower.forget(track_id)
 
 
 @router.post("/{track_id}/end", summary="End a track; what it followed stays")
-def stop_track(track_id: Id, context: ContextDep, identity: Locating) -> TrackView:
+def stop_track(track_id: Id, request: Request, context: ContextDep, identity: Locating) -> TrackView:
     """No further steps are taken. To end one that has ended changes nothing."""
     with context.transaction() as session:
         row = find_own(session, identity, Track, track_id)
         if row.status == "active":
             idle = context.follower.is_idle(row.touched_at)
+            record(session, actor(request, identity), "end", row, building_id=row.building_id)
             end_track(session, row, "idle" if idle else "asked", context.follower.now())
     context.follower.forget(track_id)
     return _show(context, row)
@@ -191,7 +194,7 @@ async def post_steps(track_id: Id, body: StepsBody, context: ContextDep, identit
             f"more than {context.settings.max_track_steps_per_s:g} steps a second; send these again in {wait_s:.1f} s",
             retry_after_s=wait_s,
         )
-    outcome = await context.follower.follow(track_id, identity.organisation_id, steps, body.flush)
+    outcome = await context.follower.follow(track_id, identity.reach, steps, body.flush)
     return Response(msgspec.json.encode(steps_answer(outcome)), media_type="application/json")
 
 
@@ -199,7 +202,7 @@ async def post_steps(track_id: Id, body: StepsBody, context: ContextDep, identit
 def get_path(
     track_id: Id,
     context: ContextDep,
-    identity: Locating,
+    identity: TrackReading,
     smoothed: Annotated[bool, Query(description="in the light of what came later, every half metre")] = False,
     from_step: FromStep = 0,
     limit: Limit = 1000,
@@ -222,7 +225,7 @@ def _smoothed(
     context: Context, identity: Identity, row: Track, from_step: int
 ) -> tuple[list[list[Any]], list[list[Any]]]:
     """Rows of settled places, and of those not settled, from a step on."""
-    live = context.follower.live(row.id, identity.organisation_id)
+    live = context.follower.live(row.id, identity.reach)
     with context.sessions() as session:
         stored = session.scalars(
             select(TrackSteps.settled)
@@ -235,7 +238,7 @@ def _smoothed(
 
 @router.get("/{track_id}/steps", summary="The steps that were followed, as they were sent")
 def get_steps(
-    track_id: Id, context: ContextDep, identity: Locating, from_step: FromStep = 0, limit: Limit = 1000
+    track_id: Id, context: ContextDep, identity: TrackReading, from_step: FromStep = 0, limit: Limit = 1000
 ) -> StepsPage:
     with context.transaction() as session:
         row = find_own(session, identity, Track, track_id)
@@ -253,7 +256,7 @@ def get_steps(
     responses={200: {"description": "JSON lines: an estimate a batch of steps; and at last whether all are as then",
                      "content": {"application/x-ndjson": {"schema": {"type": "string"}}}}},
 )  # fmt: skip
-async def replay(track_id: Id, context: ContextDep, identity: Locating) -> StreamingResponse:
+async def replay(track_id: Id, context: ContextDep, identity: TrackReading) -> StreamingResponse:
     """Every line says whether it is equal, bit for bit, to what was answered then. It is, on the same machine and
     version of the program. Nothing is changed; a client that goes away ends the work."""
 
@@ -282,7 +285,7 @@ async def _lines(context: Context, begun: Iterator[ReplayedBatch]) -> AsyncItera
 
 def _kind_of(context: Context, identity: Identity, track_id: str) -> StepKind:
     """Raises NotFound. Asks the database only for a track that is not in memory."""
-    kind = context.follower.kind_of(track_id, identity.organisation_id)
+    kind = context.follower.kind_of(track_id, identity.reach)
     if kind is None:
         with context.transaction() as session:
             row = find_own(session, identity, Track, track_id)

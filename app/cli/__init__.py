@@ -2,7 +2,20 @@
 
 import typer
 
-from app.cli import backup, calibrate, client, demo, doctor, evaluate, evaluate_tracks, keys, migrate, serve, view
+from app.cli import (
+    audit,
+    backup,
+    calibrate,
+    client,
+    demo,
+    doctor,
+    evaluate,
+    evaluate_tracks,
+    keys,
+    migrate,
+    serve,
+    view,
+)
 from app.cli.default_group import DEFAULT, DefaultGroup
 
 __all__ = ["main"]
@@ -30,6 +43,7 @@ evaluations.command(DEFAULT, hidden=True, epilog="`isodyn evaluate tracks` follo
 evaluations.command("tracks")(evaluate_tracks.tracks)
 main.add_typer(evaluations, name="evaluate")
 main.add_typer(keys.commands, name="keys")
+main.command()(audit.audit)
 main.command()(doctor.doctor)
 main.command()(backup.backup)
 main.command()(backup.restore)

@@ -1,6 +1,5 @@
 """`isodyn backup`, `isodyn restore` and `isodyn clean`, on the database and the blobs themselves."""
 
-import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
@@ -9,11 +8,11 @@ import typer
 from rich.console import Console
 
 from app.cli.environment import read_settings, say_refusals
+from app.cli.times import read_duration
 
 __all__ = ["backup", "clean", "restore"]
 
 SHORTEST = timedelta(hours=1)
-_UNITS = {"m": "minutes", "h": "hours", "d": "days"}
 
 
 def backup(
@@ -83,10 +82,7 @@ def clean(
 
 def _duration(told: str) -> timedelta:
     """Raises BadParameter for what is no duration, and for one shorter than an upload may take."""
-    found = re.fullmatch(r"(\d{1,6})([mhd])", told.strip())
-    if found is None:
-        raise typer.BadParameter(f"{told!r} is no duration; use minutes, hours or days as in 90m, 24h or 7d")
-    age = timedelta(**{_UNITS[found[2]]: int(found[1])})
+    age = read_duration(told)
     if age < SHORTEST:
         raise typer.BadParameter(f"{told} is too short: an upload at work has stored blobs that it names soon; use 1h+")
     return age

@@ -1,4 +1,4 @@
-"""The tables: organisation, key, building, floor, calibration, survey, map, job, track; and worker and idempotency.
+"""The tables: organisation, key, audit, building, floor, calibration, survey, map, job, track; worker and idempotency.
 
 Ids are UUIDv7 strings, so they sort by creation. Times are UTC. Every row that a key may reach carries its
 organisation. `migrations/` holds the same schema as history; a test compares the two.
@@ -25,6 +25,7 @@ from sqlalchemy.types import TypeDecorator
 from uuid6 import uuid7
 
 __all__ = [
+    "Audit",
     "BUILD",
     "Base",
     "Building",
@@ -94,16 +95,53 @@ class Organisation(Base):
 
 
 class Key(Base):
-    """An API key. Only its SHA-256 is kept: the key itself is shown once."""
+    """An API key. Only its SHA-256 is kept: the key itself is shown once.
+
+    `building_ids`: all that it sees and touches; null is everything of the organisation. `last_used_at` is a minute
+    behind. With `issuer` and `subject` it stands for somebody an identity provider vouches for: then `sha256` is that
+    of nothing, and scopes and buildings are those of each token."""
 
     __tablename__ = "key"
+    __table_args__ = (
+        Index("ix_key_organisation_id_issuer_subject", "organisation_id", "issuer", "subject", unique=True),
+    )
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
     organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"), index=True)
     name: Mapped[str] = mapped_column(String(200))
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     scopes: Mapped[list[str]]
+    building_ids: Mapped[list[str] | None] = mapped_column(JSON(none_as_null=True))
+    issuer: Mapped[str | None] = mapped_column(String(300))
+    subject: Mapped[str | None] = mapped_column(String(255))
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    expires_at: Mapped[datetime | None]
+    last_used_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
+
+
+class Audit(Base):
+    """What was done, by whom: a row a change, written in its transaction and never changed (`app.services.audit_log`).
+
+    `action` is the kind of object and what became of it, as in `survey.upload`. `outcome`: done, accepted (a job does
+    the rest). `key_id` is null for the command line; keys and objects are named, not referred to: the log outlives
+    them."""
+
+    __tablename__ = "audit"
+    __table_args__ = (
+        Index("ix_audit_organisation_id_id", "organisation_id", "id"),
+        Index("ix_audit_object_id", "object_id"),
+    )
+    id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
+    organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
+    at: Mapped[datetime] = mapped_column(default=utc_now, index=True)
+    key_id: Mapped[str | None] = mapped_column(Id)
+    actor: Mapped[str] = mapped_column(String(300))
+    action: Mapped[str] = mapped_column(String(60))
+    object_id: Mapped[str] = mapped_column(Id)
+    outcome: Mapped[str] = mapped_column(String(20))
+    address: Mapped[str | None] = mapped_column(String(60))
+    request_id: Mapped[str | None] = mapped_column(String(128))
+    details: Mapped[dict[str, Any]]
 
 
 class Building(Base):

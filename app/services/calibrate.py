@@ -27,6 +27,7 @@ from app.services.earth_reference import earth_at_building, told_model
 from app.services.estimate_attitude import check_vector
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
+from app.services.reach import Reach
 
 __all__ = ["CIRCLE_METHODS", "Asked", "MappedWalk", "Place", "calibrate"]
 
@@ -82,7 +83,7 @@ class Asked:
 
 
 def calibrate(
-    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: Asked
+    sessions: sessionmaker[Session], grids: GridCache, reach: Reach, asked: Asked
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
     """The fit, the reference as JSON, and the arrays it was made from.
 
@@ -90,16 +91,16 @@ def calibrate(
     """
     try:
         if asked.walk is not None:
-            return _on_a_map(sessions, grids, organisation_id, asked, asked.walk)
-        return _by_turning(sessions, organisation_id, asked)
+            return _on_a_map(sessions, grids, reach, asked, asked.walk)
+        return _by_turning(sessions, reach, asked)
     except np.linalg.LinAlgError:  # of readings that no check foresaw
         raise refusal("The readings do not determine a calibration", []) from None
 
 
 def _by_turning(
-    sessions: sessionmaker[Session], organisation_id: str, asked: Asked
+    sessions: sessionmaker[Session], reach: Reach, asked: Asked
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
-    earth = None if asked.place is None else _earth(sessions, organisation_id, asked.place)
+    earth = None if asked.place is None else _earth(sessions, reach, asked.place)
     readings = {"b_ut": asked.B_uT}
     told: dict[str, Any] = {} if earth is None else told_model(earth)
     if asked.method in CIRCLE_METHODS:
@@ -120,25 +121,25 @@ def _by_turning(
     return _SPHERES[asked.method](asked.B_uT, magnitude), told | {"magnitude_ut": magnitude}, readings
 
 
-def _earth(sessions: sessionmaker[Session], organisation_id: str, place: Place) -> EarthField:
+def _earth(sessions: sessionmaker[Session], reach: Reach, place: Place) -> EarthField:
     if place.building_id is None:
         assert place.latitude_deg is not None
         assert place.longitude_deg is not None
         return earth_field(place.latitude_deg, place.longitude_deg, place.height_m, place.on)
     with sessions() as session:
         field, _ = earth_at_building(
-            session, organisation_id, place.building_id, place.on, "/body/reference/building_id"
+            session, reach, place.building_id, place.on, "/body/reference/building_id"
         )  # fmt: skip
     return field
 
 
 def _on_a_map(
-    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: Asked, walk: MappedWalk
+    sessions: sessionmaker[Session], grids: GridCache, reach: Reach, asked: Asked, walk: MappedWalk
 ) -> tuple[CalibrationFit, dict[str, Any], Mapping[str, Array]]:
     _check_unit(walk.q)
     with sessions() as session:
         maps = active_maps(
-            session.connection(), organisation_id, building_id=walk.building_id,
+            session.connection(), reach, building_id=walk.building_id,
             floor_ids=None if walk.floor_id is None else [walk.floor_id],
         )  # fmt: skip
     if not maps:

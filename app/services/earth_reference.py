@@ -9,16 +9,17 @@ from app.db.tables import Building
 from app.earth_field import EarthField, earth_field
 from app.errors import Fault, InvalidInput, NotFound
 from app.geodesy import Anchor
+from app.services.reach import Reach
 
 __all__ = ["earth_at_building", "told_model"]
 
 
 def earth_at_building(
-    session: Session, organisation_id: str, building_id: str, on: date, location: str = "building_id"
+    session: Session, reach: Reach, building_id: str, on: date, location: str = "building_id"
 ) -> tuple[EarthField, Anchor]:
     """Raises NotFound, and InvalidInput, at `location`, for a building that has no anchor."""
     building = session.get(Building, building_id)
-    if building is None or building.organisation_id != organisation_id:
+    if building is None or not reach.holds(building.organisation_id, building.id):
         raise NotFound(f"no building {building_id}")
     if building.anchor is None:
         reason = f"building {building_id} has no anchor: PATCH its latitude, longitude, height and bearing first"

@@ -24,6 +24,7 @@ from app.geometry import Array
 from app.services.earth_reference import earth_at_building, told_model
 from app.services.grid_cache import GridCache
 from app.services.locate_window import active_maps
+from app.services.reach import Reach
 
 __all__ = [
     "AskedReference",
@@ -61,7 +62,7 @@ def estimate_attitude(
 
 
 def find_reference(
-    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: AskedReference
+    sessions: sessionmaker[Session], grids: GridCache, reach: Reach, asked: AskedReference
 ) -> tuple[MagneticReference | None, dict[str, Any]]:
     """The reference, and what it was, as JSON. Raises NotFound, Conflict (no map), IncompatibleFrames, InvalidInput."""
     if asked.kind == "none":
@@ -75,31 +76,31 @@ def find_reference(
         return level_reference(asked.horizontal_uT, asked.vertical_uT), told
     if asked.kind == "wmm":
         with sessions() as session:
-            told = earth_as_reference(session, organisation_id, asked.building_id, asked.floor_id, asked.on)
+            told = earth_as_reference(session, reach, asked.building_id, asked.floor_id, asked.on)
         return constant_reference(np.array(told["b_ut"]), told["sd_ut"]), told
-    return _of_map(sessions, grids, organisation_id, asked)
+    return _of_map(sessions, grids, reach, asked)
 
 
 def earth_as_reference(
-    session: Session, organisation_id: str, building_id: str | None, floor_id: str | None, on: date
+    session: Session, reach: Reach, building_id: str | None, floor_id: str | None, on: date
 ) -> dict[str, Any]:
     """The Earth's field in a building, or in that of a floor, as JSON: `b_ut` in its frame, and `sd_ut` per axis."""
     if building_id is None:
         floor = session.get(Floor, floor_id)
-        if floor is None or floor.organisation_id != organisation_id:
+        if floor is None or not reach.holds(floor.organisation_id, floor.building_id):
             raise NotFound(f"no floor {floor_id}")
         building_id = floor.building_id
-    field, anchor = earth_at_building(session, organisation_id, building_id, on, "/body/reference/building_id")
+    field, anchor = earth_at_building(session, reach, building_id, on, "/body/reference/building_id")
     return told_model(field) | {"b_ut": field_in_building_uT(field, anchor).tolist(), "sd_ut": STEEL_UT}
 
 
 def _of_map(
-    sessions: sessionmaker[Session], grids: GridCache, organisation_id: str, asked: AskedReference
+    sessions: sessionmaker[Session], grids: GridCache, reach: Reach, asked: AskedReference
 ) -> tuple[MagneticReference, dict[str, Any]]:
     assert asked.floor_id is not None
     assert asked.position_m is not None
     with sessions() as session:
-        maps = active_maps(session.connection(), organisation_id, floor_ids=[asked.floor_id])
+        maps = active_maps(session.connection(), reach, floor_ids=[asked.floor_id])
     if not maps:
         raise Conflict(f"floor {asked.floor_id} has no map yet; upload surveys and wait for its job")
     grid = grids.grid(maps[0].grid_sha256)

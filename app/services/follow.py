@@ -20,6 +20,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Track, utc_now
 from app.errors import Conflict, CorruptArtefact, NotFound
+from app.services.reach import Reach
 from app.services.step_order import Arranged, RawStep, arrange
 from app.services.track_estimate import SEARCHING, Told, path_row, settled_row, tell
 from app.services.track_log import Batch, TrackLog, Write, batches_of, end_idle, read_state
@@ -48,6 +49,7 @@ class Live:
 
     track_id: str
     organisation_id: str
+    building_id: str
     kind: StepKind
     tracker: Tracker
     state: TrackState
@@ -108,27 +110,23 @@ class Follower:
         self._memory = Lock()
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
-    async def follow(
-        self, track_id: str, organisation_id: str, steps: Sequence[RawStep], flush: bool = False
-    ) -> Outcome:
+    async def follow(self, track_id: str, reach: Reach, steps: Sequence[RawStep], flush: bool = False) -> Outcome:
         """Follow a batch, whole or not at all, and store it.
 
         Raises NotFound, Conflict (it has ended), InvalidInput (a fault in a step, nothing was followed).
         """
         with TRACK_BATCH_SECONDS.time():
-            outcome = await self._follow_in_turn(track_id, organisation_id, steps, flush)
+            outcome = await self._follow_in_turn(track_id, reach, steps, flush)
         for name in ("accepted", "duplicates", "late"):
             TRACK_STEPS.labels(name).inc(getattr(outcome, name))
         return outcome
 
-    async def _follow_in_turn(
-        self, track_id: str, organisation_id: str, steps: Sequence[RawStep], flush: bool
-    ) -> Outcome:
+    async def _follow_in_turn(self, track_id: str, reach: Reach, steps: Sequence[RawStep], flush: bool) -> Outcome:
         loop = asyncio.get_running_loop()
         turn = self._turns.setdefault(track_id, asyncio.Lock())
         async with turn:
             for _ in range(_TRIES):
-                work = partial(self._follow, track_id, organisation_id, steps, flush)
+                work = partial(self._follow, track_id, reach, steps, flush)
                 live, write, outcome = await loop.run_in_executor(self._pool, work)
                 if write is None:
                     return outcome
@@ -143,28 +141,28 @@ class Follower:
         if live.ended_reason is not None or self.is_idle(live.touched_at):
             raise _ended(live.track_id, live.ended_reason or "idle", self.idle_timeout_s)
 
-    def live(self, track_id: str, organisation_id: str) -> Live:
+    def live(self, track_id: str, reach: Reach) -> Live:
         """The track as it is stored, with its state. Raises NotFound."""
         with self._sessions() as session:
             stored = session.execute(
-                select(Track.version).where(Track.id == track_id, Track.organisation_id == organisation_id)
-            ).scalar_one_or_none()
-        if stored is None:
+                select(Track.version, Track.organisation_id, Track.building_id).where(Track.id == track_id)
+            ).one_or_none()
+        if stored is None or not reach.holds(stored.organisation_id, stored.building_id):
             raise NotFound(f"no track {track_id}")
         with self._memory:
             held = self._live.get(track_id)
-        return held if held is not None and held.version == stored else self._load(track_id, organisation_id)
+        return held if held is not None and held.version == stored.version else self._load(track_id, reach)
 
     def forget(self, track_id: str) -> None:
         """Drop a state from memory."""
         with self._memory:
             self._drop(track_id)
 
-    def kind_of(self, track_id: str, organisation_id: str) -> StepKind | None:
+    def kind_of(self, track_id: str, reach: Reach) -> StepKind | None:
         """What the steps of a track are that is in memory; asks nobody."""
         with self._memory:
             live = self._live.get(track_id)
-        return live.kind if live is not None and live.organisation_id == organisation_id else None
+        return live.kind if live is not None and reach.holds(live.organisation_id, live.building_id) else None
 
     def now(self) -> datetime:
         return self._clock()
@@ -189,12 +187,12 @@ class Follower:
         self._log.close()
 
     def _follow(
-        self, track_id: str, organisation_id: str, steps: Sequence[RawStep], flush: bool
+        self, track_id: str, reach: Reach, steps: Sequence[RawStep], flush: bool
     ) -> tuple[Live, Write | None, Outcome]:
         with self._memory:
             live = self._live.get(track_id)
-        if live is None or live.organisation_id != organisation_id:
-            live = self._load(track_id, organisation_id)
+        if live is None or not reach.holds(live.organisation_id, live.building_id):
+            live = self._load(track_id, reach)
         self.check_active(live)
         arranged = arrange(steps, live.waiting, live.gaps, live.next_step, live.last, flush)
         if not arranged.ready and arranged.waiting == live.waiting:
@@ -202,12 +200,12 @@ class Follower:
         went, write = _go_on(live, arranged, self._clock())
         return went, write, _outcome(went, arranged)
 
-    def _load(self, track_id: str, organisation_id: str) -> Live:
+    def _load(self, track_id: str, reach: Reach) -> Live:
         """From the database: the state that was kept last, and every batch after it once more."""
         with self._sessions() as session:
             kept = read_state(session, track_id)  # before the row, so that it is never ahead of it
             row = session.get(Track, track_id)
-        if row is None or row.organisation_id != organisation_id:
+        if row is None or not reach.holds(row.organisation_id, row.building_id):
             raise NotFound(f"no track {track_id}")
         live = self._restored(row, kept)
         self._keep(live)
@@ -232,7 +230,7 @@ class Follower:
                 kept_step = batch.next_step
             estimate, last = batch.estimate, batch.steps[-1]
         return Live(
-            row.id, row.organisation_id, kind, tracker, state, row.version, row.batches,
+            row.id, row.organisation_id, row.building_id, kind, tracker, state, row.version, row.batches,
             row.next_step, tuple(row.waiting), tuple((first, stop) for first, stop in row.gaps), last, estimate,
             kept_step, row.touched_at, row.ended_reason,
         )  # fmt: skip

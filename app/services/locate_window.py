@@ -14,6 +14,7 @@ from app.positioning.fix import Fix, LocateOptions, Prior
 from app.positioning.locate import locate_and_explain
 from app.positioning.window import Composition, Window
 from app.services.grid_cache import GridCache
+from app.services.reach import Reach
 
 __all__ = ["ActiveMap", "LocateResult", "active_maps", "locate_window"]
 
@@ -39,15 +40,18 @@ class LocateResult:
 
 def active_maps(
     connection: Connection,
-    organisation_id: str,
+    reach: Reach,
     *,
     building_id: str | None = None,
     floor_ids: Sequence[str] | None = None,
 ) -> list[ActiveMap]:
-    """The active maps of a building's floors, or of the floors named. Raises NotFound for a named floor that does
-    not exist here; a floor without a map is simply not among them."""
-    asked = {"organisation_id": organisation_id, "building_id": building_id, "floor_ids": floor_ids}
-    statement = _active_maps(building_id is not None, floor_ids is not None)
+    """The active maps of a building's floors, or of the floors named. Raises NotFound for a named floor that is not
+    within reach; a floor without a map is simply not among them."""
+    asked = {
+        "organisation_id": reach.organisation_id, "building_id": building_id, "floor_ids": floor_ids,
+        "within": reach.building_ids,
+    }  # fmt: skip
+    statement = _active_maps(building_id is not None, floor_ids is not None, reach.building_ids is not None)
     rows = connection.execute(statement, {name: value for name, value in asked.items() if value is not None}).all()
     for missing in sorted(set(floor_ids or ()) - {row[0] for row in rows}):
         raise NotFound(f"no floor {missing}" + (" in this building" if building_id else ""))
@@ -55,7 +59,7 @@ def active_maps(
 
 
 @cache
-def _active_maps(of_building: bool, of_floors: bool) -> Select[str, str | None, str | None]:
+def _active_maps(of_building: bool, of_floors: bool, limited: bool) -> Select[str, str | None, str | None]:
     """The statement, made once: to put it together costs several times what it takes to execute."""
     statement: Select[str, str | None, str | None] = (
         select(Floor.id, Map.id, Map.grid_sha256)
@@ -67,6 +71,8 @@ def _active_maps(of_building: bool, of_floors: bool) -> Select[str, str | None, 
         statement = statement.where(Floor.building_id == bindparam("building_id"))
     if of_floors:
         statement = statement.where(Floor.id.in_(bindparam("floor_ids", expanding=True)))
+    if limited:
+        statement = statement.where(Floor.building_id.in_(bindparam("within", expanding=True)))
     return statement
 
 

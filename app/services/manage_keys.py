@@ -1,111 +1,168 @@
-"""API keys: made, shown once, kept as a hash, recognised, revoked."""
+"""API keys: made, shown once, kept as a hash, rotated, revoked. `app.services.key_ring` recognises them."""
 
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from hashlib import sha256
-from time import monotonic
+from datetime import datetime, timedelta
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.orm import Session
 
-from app.db.tables import Key, Organisation
-from app.errors import InvalidInput, NotFound
+from app.db.tables import Building, Key, Organisation, utc_now
+from app.errors import Conflict, InvalidInput, NotFound
+from app.services.audit_log import COMMAND_LINE, Actor, record
+from app.services.key_ring import digest
 
-__all__ = ["SCOPES", "Identity", "KeyRing", "create_key", "ensure_admin_key", "recognise_key", "revoke_key"]
+__all__ = [
+    "OPERATOR",
+    "OVERLAP",
+    "SCOPES",
+    "MadeKey",
+    "create_key",
+    "ensure_admin_key",
+    "find_key",
+    "make_key",
+    "revoke_key",
+    "rotate_key",
+]
 
-SCOPES = ("admin", "survey:write", "map:read", "map:write", "locate")
+SCOPES = ("admin", "survey:write", "map:read", "map:write", "locate", "track:read")
+OPERATOR = "default"
+"""The organisation of whoever runs the installation: that of `ISODYN_ADMIN_KEY`."""
+OVERLAP = timedelta(hours=24)
+"""How long a key that was rotated goes on to work, unless told otherwise."""
 KEY_PREFIX = "isd_"
-RECENT_S = 2.0  # a revoked key may still be taken for this long
-MOST_RECENT = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
-    """Who asks: the organisation whose things are visible, and what may be done with them."""
+class MadeKey:
+    """A new key, and the key itself, which is not kept."""
 
-    organisation_id: str
-    scopes: frozenset[str]
-    key_id: str
-
-    def may(self, *any_of: str) -> bool:
-        """Whether the key has one of these scopes; `admin` has them all."""
-        return "admin" in self.scopes or not self.scopes.isdisjoint(any_of)
+    row: Key
+    secret: str
 
 
-def create_key(
-    session: Session, *, organisation: str, name: str, scopes: Collection[str], secret: str | None = None
-) -> str:
-    """A new key of the organisation (made if new). Returns the key itself, which is not kept."""
+def make_key(
+    session: Session,
+    owner: Organisation,
+    by: Actor,
+    *,
+    name: str,
+    scopes: Collection[str],
+    building_ids: Collection[str] | None = None,
+    expires_at: datetime | None = None,
+    secret: str | None = None,
+) -> MadeKey:
+    """A new key of an organisation, limited to `building_ids` where there are any.
+
+    Raises InvalidInput for an unknown scope, no building at all, or an end that has passed; NotFound for a building
+    that is not the organisation's.
+    """
     unknown = sorted(set(scopes) - set(SCOPES))
     if unknown or not scopes:
         raise InvalidInput(f"unknown scope {', '.join(unknown) or '(none given)'}; choose from {', '.join(SCOPES)}")
+    if expires_at is not None and expires_at <= utc_now():
+        raise InvalidInput(f"{expires_at:%Y-%m-%d %H:%M} UTC has passed: the key would never work")
+    if building_ids is not None:
+        _check_buildings(session, owner.id, building_ids)
+    secret = secret or KEY_PREFIX + secrets.token_urlsafe(32)
+    row = Key(
+        organisation_id=owner.id,
+        name=name,
+        sha256=digest(secret),
+        scopes=sorted(scopes),
+        building_ids=None if building_ids is None else sorted(building_ids),
+        expires_at=expires_at,
+    )
+    session.add(row)
+    session.flush()
+    record(session, by, "create", row, name=name, scopes=row.scopes, building_ids=row.building_ids,
+           expires_at=_told(expires_at))  # fmt: skip
+    return MadeKey(row, secret)
+
+
+def create_key(
+    session: Session, *, organisation: str, name: str, scopes: Collection[str], secret: str | None = None,
+    building_ids: Collection[str] | None = None, expires_at: datetime | None = None, by: Actor = COMMAND_LINE,
+) -> str:  # fmt: skip
+    """The same for an organisation by name, which is made if new. Returns the key itself, which is not kept."""
     owner = session.scalars(select(Organisation).where(Organisation.name == organisation)).one_or_none()
     if owner is None:
         owner = Organisation(name=organisation)
         session.add(owner)
         session.flush()
-    secret = secret or KEY_PREFIX + secrets.token_urlsafe(32)
-    session.add(Key(organisation_id=owner.id, name=name, sha256=_digest(secret), scopes=sorted(scopes)))
-    return secret
+    made = make_key(session, owner, by, name=name, scopes=scopes, building_ids=building_ids, expires_at=expires_at,
+                    secret=secret)  # fmt: skip
+    return made.secret
 
 
 def ensure_admin_key(session: Session, wanted: str | None) -> str | None:
     """At start: make the wanted admin key if it is not there, or one of our own if there is no key at all.
 
-    Returns a key only when one was made here that nobody has seen yet. Raises InvalidInput for a revoked one.
+    Returns a key only when one was made here that nobody has seen yet. Raises InvalidInput for one that has ended.
     """
     if wanted:
-        known = session.execute(select(Key.revoked_at).where(Key.sha256 == _digest(wanted))).one_or_none()
-        if known is not None and known.revoked_at is not None:
-            raise InvalidInput("the key in ISODYN_ADMIN_KEY was revoked; set another, or leave it unset")
+        known = session.scalars(select(Key).where(Key.sha256 == digest(wanted))).one_or_none()
+        if known is not None and has_ended(known):
+            raise InvalidInput("the key in ISODYN_ADMIN_KEY was revoked or has expired; set another, or leave it unset")
         if known is None:
-            create_key(session, organisation="default", name="admin (settings)", scopes=["admin"], secret=wanted)
+            create_key(session, organisation=OPERATOR, name="admin (settings)", scopes=["admin"], secret=wanted)
         return None
     if session.scalars(select(Key.id).limit(1)).first() is not None:
         return None
-    return create_key(session, organisation="default", name="admin (first start)", scopes=["admin"])
+    return create_key(session, organisation=OPERATOR, name="admin (first start)", scopes=["admin"])
 
 
-def recognise_key(session: Session, secret: str) -> Identity | None:
-    """Whose key this is, or None. Found by its SHA-256: keys are 256 random bits, so a fast hash is enough."""
-    row = session.execute(
-        select(Key.organisation_id, Key.scopes, Key.id).where(Key.sha256 == _digest(secret), Key.revoked_at.is_(None))
-    ).one_or_none()
-    return None if row is None else Identity(row.organisation_id, frozenset(row.scopes), row.id)
-
-
-class KeyRing:
-    """Recognises keys and remembers those of the last seconds: a busy client costs one look-up in `RECENT_S`."""
-
-    def __init__(self, sessions: sessionmaker[Session]) -> None:
-        self._sessions = sessions
-        self._recent: dict[str, tuple[float, Identity]] = {}
-
-    def recent(self, secret: str) -> Identity | None:
-        """Whose key this is if it was recognised a moment ago; asks nobody."""
-        until, identity = self._recent.get(_digest(secret), (0.0, None))
-        return identity if monotonic() < until else None
-
-    def recognise(self, secret: str) -> Identity | None:
-        """Whose key this is, by the database."""
-        with self._sessions() as session:
-            identity = recognise_key(session, secret)
-        if identity is not None:
-            if len(self._recent) >= MOST_RECENT:
-                self._recent.clear()
-            self._recent[_digest(secret)] = (monotonic() + RECENT_S, identity)
-        return identity
-
-
-def revoke_key(session: Session, key_id: str) -> None:
-    """Make a key useless from now on. Raises NotFound."""
-    key = session.get(Key, key_id)
-    if key is None:
+def find_key(session: Session, key_id: str) -> Key:
+    """Any organisation's. Raises NotFound."""
+    row = session.get(Key, key_id)
+    if row is None:
         raise NotFound(f"no key {key_id}; `isodyn keys list` shows them")
-    key.revoked_at = key.revoked_at or datetime.now(UTC)
+    return row
 
 
-def _digest(secret: str) -> str:
-    return sha256(secret.encode()).hexdigest()
+def rotate_key(session: Session, row: Key, by: Actor, overlap: timedelta = OVERLAP) -> MadeKey:
+    """A new key with the name, scopes, buildings and span of life of this one, which ends after the overlap.
+
+    Raises Conflict for one that has ended, or that has no secret.
+    """
+    if row.subject is not None:
+        raise Conflict(f"key {row.id} stands for a subject of {row.issuer}: there is no secret to rotate")
+    if has_ended(row):
+        raise Conflict(f"key {row.id} was revoked or has expired; make a new one")
+    now = utc_now()
+    owner = session.get_one(Organisation, row.organisation_id)
+    lives = None if row.expires_at is None else row.expires_at - row.created_at
+    made = make_key(
+        session, owner, by, name=row.name, scopes=row.scopes, building_ids=row.building_ids,
+        expires_at=None if lives is None else now + lives,
+    )  # fmt: skip
+    ends_at = now + overlap
+    row.expires_at = ends_at if row.expires_at is None else min(row.expires_at, ends_at)
+    record(session, by, "rotate", row, new_key_id=made.row.id, expires_at=_told(row.expires_at))
+    return made
+
+
+def revoke_key(session: Session, key_id: str, by: Actor = COMMAND_LINE) -> None:
+    """Make a key useless from now on; once more changes nothing. Raises NotFound."""
+    row = find_key(session, key_id)
+    if row.revoked_at is None:
+        row.revoked_at = utc_now()
+        record(session, by, "revoke", row)
+
+
+def has_ended(row: Key) -> bool:
+    """Whether it was revoked or has expired."""
+    return row.revoked_at is not None or (row.expires_at is not None and row.expires_at <= utc_now())
+
+
+def _check_buildings(session: Session, organisation_id: str, building_ids: Collection[str]) -> None:
+    if not building_ids:
+        raise InvalidInput("a key that is limited to buildings needs one at least; leave them out for all")
+    mine = select(Building.id).where(Building.organisation_id == organisation_id, Building.id.in_(building_ids))
+    for missing in sorted(set(building_ids) - set(session.scalars(mine))):
+        raise NotFound(f"no building {missing}")
+
+
+def _told(at: datetime | None) -> str | None:
+    return None if at is None else at.isoformat(timespec="seconds")

@@ -1,4 +1,4 @@
-"""One organisation's view of the source: every question it asks carries that organisation and no other."""
+"""What somebody reaches of the source: every question it asks carries that reach and no other."""
 
 import threading
 from collections import OrderedDict
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.geometry import Array
+from app.services.reach import Reach
 from app.viewer.layers import difference_uT, layer_values
 from app.viewer.pointing import walk_residuals
 from app.viewer.scene import plan_picture
@@ -86,20 +87,20 @@ class _Residuals:
 
 
 class OrganisationContent:
-    """What one organisation's viewer can reach: there is no way to name another's object here."""
+    """What one organisation's viewer, or one of some of its buildings, can reach: no other object has a name here."""
 
-    def __init__(self, organisation_id: str, source: ViewerSource, recent: RecentlyUsed) -> None:
-        self._organisation_id = organisation_id
+    def __init__(self, reach: Reach, source: ViewerSource, recent: RecentlyUsed) -> None:
+        self._reach = reach
         self._source = source
         self._recent = recent
 
     def buildings(self) -> list[ViewedBuilding]:
-        return self._source.buildings(self._organisation_id)
+        return self._source.buildings(self._reach)
 
     def map(self, map_id: str) -> ViewedMap:
         """Raises NotFound."""
-        key = (self._organisation_id, "map", map_id)
-        return self._recent.get(key, ViewedMap, lambda: self._source.map(self._organisation_id, map_id))
+        key = (self._reach, "map", map_id)
+        return self._recent.get(key, ViewedMap, lambda: self._source.map(self._reach, map_id))
 
     def layer(self, map_id: str, layer: str, height_index: int, versus_id: str | None = None) -> Array:
         """One layer of a map at one height, (ny, nx); `difference` is the one to the map `versus_id`.
@@ -114,27 +115,27 @@ class OrganisationContent:
                 stored["difference"] = difference_uT(shown.grid, self.map(versus_id).grid)
             return layer_values(shown.grid, layer, height_index, stored)
 
-        key = (self._organisation_id, "layer", map_id, layer, height_index, versus_id)
+        key = (self._reach, "layer", map_id, layer, height_index, versus_id)
         return self._recent.get(key, np.ndarray, make)
 
     def walks(self, floor_id: str) -> list[Walk]:
         """Raises NotFound."""
-        key = (self._organisation_id, "walks", floor_id)
+        key = (self._reach, "walks", floor_id)
         known = self._recent.peek(key, _Walks)
-        walks = self._source.walks(self._organisation_id, floor_id, known.by_survey if known else {})
+        walks = self._source.walks(self._reach, floor_id, known.by_survey if known else {})
         self._recent.put(key, _Walks({walk.survey_id: walk for walk in walks}))
         return walks
 
     def residuals_uT(self, map_id: str, walks: Sequence[Walk]) -> tuple[Array, ...]:
         """(n,) of each walk, what it measured less the map (`walk_residuals`). Raises NotFound."""
-        key = (self._organisation_id, "residuals", map_id, *(walk.survey_id for walk in walks))
+        key = (self._reach, "residuals", map_id, *(walk.survey_id for walk in walks))
         return self._recent.get(key, _Residuals, lambda: _Residuals(walk_residuals(self.map(map_id).grid, walks))).each
 
     def plan(self, floor: ViewedFloor) -> NDArray[np.uint8]:
         """The picture of a floor's plan (rows, columns, 3), as large as it is drawn. Raises NotFound."""
-        key = (self._organisation_id, "plan", floor.id, floor.plan.sha256 if floor.plan else None)
+        key = (self._reach, "plan", floor.id, floor.plan.sha256 if floor.plan else None)
 
         def make() -> NDArray[np.uint8]:
-            return plan_picture(self._source.plan_image(self._organisation_id, floor.id))
+            return plan_picture(self._source.plan_image(self._reach, floor.id))
 
         return self._recent.get(key, np.ndarray, make)

@@ -115,7 +115,7 @@ class ViewerApp:
         session = await self.signed_in.open(form.get("key", "").strip())
         if session is None:
             return _sign_in_page(request, _link(form), wrong_key=True)
-        self._scenes.expect(session.organisation_id)
+        self._scenes.expect(session.reach)
         query = urlencode(_link(form))
         address = f"{_prefix(request)}/" + (f"?{query}" if query else "")
         response = RedirectResponse(address, HTTPStatus.SEE_OTHER, SECURITY_HEADERS)
@@ -164,7 +164,7 @@ class ViewerApp:
         session = await self._session(request)
         if session is None:
             return refusal(HTTPStatus.UNAUTHORIZED, "sign in again")
-        buildings = await run_in_threadpool(self._source.buildings, session.organisation_id)
+        buildings = await run_in_threadpool(self._source.buildings, session.reach)
         shown = [
             {"id": b.id, "name": b.name,
              "floors": [{"id": f.id, "name": f.name, "ordinal": f.ordinal, "map_id": f.map_id} for f in b.floors]}
@@ -182,7 +182,7 @@ class ViewerApp:
         link = _link(request.query_params)
         try:
             asked = Shown.model_validate({ASKED_BY[name]: link[name] for name in ASKED_BY if name in link})
-            png = await run_in_threadpool(poster_png, self.pool.content(session.organisation_id), asked)
+            png = await run_in_threadpool(poster_png, self.pool.content(session.reach), asked)
         except (ValueError, InvalidInput):
             png = None
         headers = {**SECURITY_HEADERS, "Cache-Control": "no-store"}

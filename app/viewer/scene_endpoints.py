@@ -21,6 +21,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from app.errors import Conflict, IsodynError, NotFound
+from app.services.reach import Reach
 from app.viewer.asked import Marks, Shown, Target
 from app.viewer.chosen import choose
 from app.viewer.client_scene import ClientScene
@@ -68,14 +69,14 @@ class SceneEndpoints:
         if request.url.query:
             return RedirectResponse(request.url.path, HTTPStatus.SEE_OTHER, SECURITY_HEADERS)
         try:
-            page = await self._ready(session.organisation_id)
+            page = await self._ready(session.reach)
         except httpx.TransportError:
             return refusal(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting again; load this page once more")
         return _page_response(page, request)
 
-    def expect(self, organisation_id: str) -> None:
+    def expect(self, reach: Reach) -> None:
         """Somebody of the organisation is about to look: begin to make ready, and wait for nobody."""
-        task = asyncio.create_task(self._ready(organisation_id))
+        task = asyncio.create_task(self._ready(reach))
         self._expected.add(task)
         task.add_done_callback(self._arrived)
 
@@ -84,14 +85,14 @@ class SceneEndpoints:
         if not task.cancelled() and task.exception() is not None:
             _log.warning("the viewer could not be made ready", exc_info=task.exception())
 
-    async def _ready(self, organisation_id: str) -> ViserPage:
+    async def _ready(self, reach: Reach) -> ViserPage:
         """The organisation's server started, and viser's page, which is the same for all. Raises TransportError."""
-        async with self._pool.visit(organisation_id) as viewer:
+        async with self._pool.visit(reach) as viewer:
             try:
                 if self._page is None:
                     self._page = await fetch_page(viewer.http_url)
             except httpx.TransportError:
-                await self._pool.discard(organisation_id, viewer)
+                await self._pool.discard(reach, viewer)
                 raise
         return self._page
 
@@ -112,10 +113,10 @@ class SceneEndpoints:
             return
         ended = asyncio.ensure_future(self._signed_in.until_ended(session))
         try:
-            async with self._pool.visit(session.organisation_id) as viewer:
+            async with self._pool.visit(session.reach) as viewer:
                 reached = await relay(websocket, viewer.websocket_url(view), ended)
             if not reached:
-                await self._pool.discard(session.organisation_id, viewer)
+                await self._pool.discard(session.reach, viewer)
         finally:
             ended.cancel()
 
@@ -159,7 +160,7 @@ class SceneEndpoints:
         view = None if session is None else _view(request.path_params["view"], session)
         if session is None or view is None:
             raise NotFound("there is no such view; sign in again")
-        async with self._pool.visit(session.organisation_id) as viewer:
+        async with self._pool.visit(session.reach) as viewer:
             if make_ready is not None and view not in viewer.scenes:
                 await run_in_threadpool(make_ready, viewer.content)
             for _ in range(int(self._connects_within_s / _LOOKS_EVERY_S)):

@@ -1,7 +1,7 @@
 """Who is signed in to the page: random session ids, kept in this process's memory until they expire.
 
-A session remembers the key it was opened with (the cookie never carries it), so that revoking the key closes the page
-within a minute.
+A session remembers the key it was opened with (the cookie never carries it), so that the page is closed within
+`RECHECK_SECONDS` of the key's end.
 """
 
 import asyncio
@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 
 from starlette.concurrency import run_in_threadpool
 
+from app.services.reach import Reach
 from app.viewer.source import Authenticate, Identity, may_view
 
 __all__ = ["RECHECK_SECONDS", "Session", "SignedIn"]
 
-RECHECK_SECONDS = 60.0
+RECHECK_SECONDS = 5.0
 _MOST_SESSIONS = 10_000
 
 
@@ -28,7 +29,7 @@ class Session:
 
     id: str = field(repr=False)
     key: str = field(repr=False)
-    organisation_id: str
+    reach: Reach
     scopes: frozenset[str]
     expires_at: float
     checked_at: float
@@ -56,14 +57,14 @@ class SignedIn:
         self._drop_expired()
         now = self._clock()
         session = Session(
-            secrets.token_urlsafe(32), key, identity.organisation_id, frozenset(identity.scopes),
+            secrets.token_urlsafe(32), key, identity.reach, frozenset(identity.scopes),
             now + self._lifetime_s, checked_at=now,
         )  # fmt: skip
         self._sessions[session.id] = session
         return session
 
     async def find(self, session_id: str | None) -> Session | None:
-        """The live session with this id, its key checked again when the last check is a minute old."""
+        """The live session with this id, its key checked again when the last check is `RECHECK_SECONDS` old."""
         session = self._sessions.get(session_id or "")
         if session is None:
             return None
@@ -74,7 +75,7 @@ class SignedIn:
         if now - session.checked_at >= RECHECK_SECONDS:
             session.checked_at = now
             identity = await self._identity(session.key)
-            if identity is None or identity.organisation_id != session.organisation_id:
+            if identity is None or identity.reach != session.reach:
                 self.close(session)
                 return None
         return None if session.ended.is_set() else session

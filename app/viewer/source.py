@@ -1,7 +1,7 @@
 """What the viewer asks of the rest of the house: who is signed in, and what may be shown to them.
 
 The page never sees the database. The composition root hands it one callable (key to identity) and one `ViewerSource`;
-every question carries the organisation, so an answer can only ever be about that organisation's own objects.
+every question carries the reach of whoever asks, so an answer can only ever be about objects within it.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -11,6 +11,7 @@ from typing import Protocol
 from app.field.grid import FieldGrid
 from app.field.samples import Samples
 from app.geometry import Array
+from app.services.reach import Reach
 from app.viewer.layers import StoredLayers
 
 __all__ = [
@@ -30,7 +31,7 @@ class Identity(Protocol):
     """Whoever a key belongs to."""
 
     @property
-    def organisation_id(self) -> str: ...
+    def reach(self) -> Reach: ...
 
     @property
     def scopes(self) -> Collection[str]: ...
@@ -111,24 +112,24 @@ class Walk:
 
 
 class ViewerSource(Protocol):
-    """What can be shown, one organisation at a time. Called from worker threads, several at once."""
+    """What can be shown to somebody, by their reach. Called from worker threads, several at once."""
 
-    def buildings(self, organisation_id: str) -> list[ViewedBuilding]:
-        """Every building of the organisation, by name."""
+    def buildings(self, reach: Reach) -> list[ViewedBuilding]:
+        """Every building within reach, by name."""
         ...
 
-    def map(self, organisation_id: str, map_id: str) -> ViewedMap:
-        """A map. Raises NotFound for one that is not ready or not the organisation's."""
+    def map(self, reach: Reach, map_id: str) -> ViewedMap:
+        """A map. Raises NotFound for one that is not ready or not within reach."""
         ...
 
-    def walks(self, organisation_id: str, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
+    def walks(self, reach: Reach, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
         """The walks that count towards a floor's map; those in `known` (by survey id) are not read again.
 
-        Raises NotFound for a floor that is not the organisation's.
+        Raises NotFound for a floor that is not within reach.
         """
         ...
 
-    def plan_image(self, organisation_id: str, floor_id: str) -> bytes:
-        """The picture of a floor's plan, PNG or WebP. Raises NotFound for a floor that has none or is not the
-        organisation's."""
+    def plan_image(self, reach: Reach, floor_id: str) -> bytes:
+        """The picture of a floor's plan, PNG or WebP. Raises NotFound for a floor that has none or is not
+        within reach."""
         ...

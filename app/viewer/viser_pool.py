@@ -1,6 +1,7 @@
-"""One viser server per organisation, started by its first visitor and stopped when nobody has looked for a while.
+"""One viser server per organisation, started by its first visitor and stopped when nobody has looked for a while; keys
+that are limited to the same buildings share one of their own.
 
-Isolation is by construction: an organisation's server is made with that organisation's content only. Nothing is put
+Isolation is by construction: a server is made with the content within that reach only. Nothing is put
 into a server's shared scene; a connection that does not bring the server's secret in its path (any other program on
 this machine) gets an empty page.
 """
@@ -21,6 +22,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 import numpy as np
 from starlette.concurrency import run_in_threadpool
 
+from app.services.reach import Reach
 from app.viewer.client_scene import ClientScene
 from app.viewer.content import OrganisationContent, RecentlyUsed
 from app.viewer.layers import ColourScale
@@ -93,7 +95,7 @@ class OrganisationViewer:
 
 
 class ViserPool:
-    """The servers by organisation. `clock` counts seconds and never goes back."""
+    """The servers by reach. `clock` counts seconds and never goes back."""
 
     def __init__(
         self, source: ViewerSource, idle_seconds: float = 600.0, clock: Callable[[], float] = time.monotonic
@@ -102,26 +104,26 @@ class ViserPool:
         self._idle_seconds = idle_seconds
         self._clock = clock
         self._recent = RecentlyUsed(_RECENT_BYTES)
-        self._viewers: dict[str, OrganisationViewer] = {}
+        self._viewers: dict[Reach, OrganisationViewer] = {}
         self._lock = asyncio.Lock()
         self._sweeper: asyncio.Task[None] | None = None
 
-    def content(self, organisation_id: str) -> OrganisationContent:
+    def content(self, reach: Reach) -> OrganisationContent:
         """What the organisation's viewer can reach, whether its server runs or not."""
-        return OrganisationContent(organisation_id, self._source, self._recent)
+        return OrganisationContent(reach, self._source, self._recent)
 
-    def running(self) -> dict[str, OrganisationViewer]:
-        """The servers running now, by organisation."""
+    def running(self) -> dict[Reach, OrganisationViewer]:
+        """The servers running now."""
         return dict(self._viewers)
 
     @contextlib.asynccontextmanager
-    async def visit(self, organisation_id: str) -> AsyncIterator[OrganisationViewer]:
+    async def visit(self, reach: Reach) -> AsyncIterator[OrganisationViewer]:
         """The organisation's server, started if need be, and kept while the visit lasts."""
         async with self._lock:
-            viewer = self._viewers.get(organisation_id)
+            viewer = self._viewers.get(reach)
             if viewer is None:
-                viewer = await run_in_threadpool(self._start, organisation_id)
-                self._viewers[organisation_id] = viewer
+                viewer = await run_in_threadpool(self._start, reach)
+                self._viewers[reach] = viewer
             if self._sweeper is None:
                 self._sweeper = asyncio.create_task(self._sweep())
             viewer.visitors += 1
@@ -131,20 +133,20 @@ class ViserPool:
             viewer.visitors -= 1
             viewer.idle_since = self._clock()
 
-    async def discard(self, organisation_id: str, viewer: OrganisationViewer) -> None:
+    async def discard(self, reach: Reach, viewer: OrganisationViewer) -> None:
         """Stop a server that no longer answers; the next visit starts another."""
         async with self._lock:
-            if self._viewers.get(organisation_id) is viewer:
-                del self._viewers[organisation_id]
+            if self._viewers.get(reach) is viewer:
+                del self._viewers[reach]
                 await run_in_threadpool(stop_viser, viewer.server)
 
     async def stop_idle(self) -> None:
         """Stop every server that nobody has looked at for `idle_seconds`."""
         async with self._lock:
             now = self._clock()
-            for organisation_id, viewer in list(self._viewers.items()):
+            for reach, viewer in list(self._viewers.items()):
                 if viewer.visitors == 0 and now - viewer.idle_since >= self._idle_seconds:
-                    del self._viewers[organisation_id]
+                    del self._viewers[reach]
                     await run_in_threadpool(stop_viser, viewer.server)
 
     async def close(self) -> None:
@@ -164,15 +166,15 @@ class ViserPool:
             await asyncio.sleep(max(self._idle_seconds / 4, 0.05))
             await self.stop_idle()
 
-    def _start(self, organisation_id: str) -> OrganisationViewer:
+    def _start(self, reach: Reach) -> OrganisationViewer:
         ColourScale(0.0, 1.0).rgb(np.zeros(1))  # loads what colours need before the first picture waits for it
-        viewer = OrganisationViewer(start_viser(), self.content(organisation_id), secrets.token_urlsafe(32))
+        viewer = OrganisationViewer(start_viser(), self.content(reach), secrets.token_urlsafe(32))
 
         def welcome(client: ClientHandle) -> None:
             try:
                 viewer.welcome(client)
             except Exception:
-                _log.exception("a scene could not be made for organisation %s", organisation_id)
+                _log.exception("a scene could not be made for organisation %s", reach.organisation_id)
 
         viewer.server.on_client_connect(welcome)
         viewer.server.on_client_disconnect(viewer.farewell)

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,9 +119,9 @@ def stranger() -> dict[str, str]:
 def key_with(service: Service) -> Callable[..., dict[str, str]]:
     """Headers of a new key of the first organisation with these scopes."""
 
-    def make(*scopes: str) -> dict[str, str]:
+    def make(*scopes: str, name: str = "test", **more: Any) -> dict[str, str]:
         with service.context.transaction() as session:
-            key = create_key(session, organisation="default", name="test", scopes=scopes)
+            key = create_key(session, **{"organisation": "default"} | more, name=name, scopes=scopes)
         return {"Authorization": f"Bearer {key}"}
 
     return make
@@ -158,3 +159,25 @@ def mapped_floor(service: Service, building: str) -> str:
 @pytest.fixture(scope="module")
 def active_map(service: Service, mapped_floor: str) -> str:
     return str(service.http.get(f"/v1/floors/{mapped_floor}").json()["active_map_id"])
+
+
+@pytest.fixture(scope="module")
+def ids(service: Service, building: str, mapped_floor: str, active_map: str) -> dict[str, str]:
+    """An object of every kind there is, of the first organisation, by the name that paths have for its id."""
+    http = service.http
+    track = http.post("/v1/tracks", json={"floor_ids": [mapped_floor], "frame": "norm", "name": "a lift"}).json()["id"]
+    rng = np.random.default_rng(0)
+    turned = rng.normal(size=(200, 3))
+    readings = 50.0 * (turned / np.linalg.norm(turned, axis=1, keepdims=True) + rng.normal(0, 0.001, (200, 3)))
+    reference = {"magnitude_ut": 50.0}
+    body = {"device": "phone", "method": "ellipsoid", "reference": reference, "b_ut": readings.tolist()}
+    return {
+        "calibration_id": http.post("/v1/calibrations", json=body).json()["id"],
+        "track_id": track,
+        "building_id": building,
+        "floor_id": mapped_floor,
+        "map_id": active_map,
+        "survey_id": http.get(f"/v1/floors/{mapped_floor}/surveys").json()["items"][0]["id"],
+        "job_id": http.get("/v1/jobs", params={"floor_id": mapped_floor}).json()["items"][0]["id"],
+        "key_id": http.post("/v1/keys", json={"name": "spare", "scopes": ["map:read"]}).json()["id"],
+    }

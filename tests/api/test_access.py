@@ -1,109 +1,32 @@
-"""Keys, scopes, and that an organisation sees nothing of another: a matrix over every route there is."""
+"""Keys and scopes over every route there is; lists, repeated requests and problems. Isolation: `test_isolation`."""
 
-import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from fastapi.routing import APIRoute
+
+from app.db.tables import Key, utc_now
+from tests.api.calls import call, picture, routes
 
 OPEN = {"/healthz", "/readyz"}
 LOCATING = ("/locate", "/locate:batch", "/replay")
 OF_DEVICES = ("/v1/tracks", "/v1/calibrations", "/v1/attitudes", "/v1/reference-field")
-OUTLINE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 5], [0, 5], [0, 0]]]}
-BODIES: dict[str, Any] = {
-    "/v1/buildings/{building_id}/floors": {"name": "x", "ordinal": 1},
-    "/v1/floors/{floor_id}/maps": {},
-    "/v1/maps/{map_id}/field": {"points_m": [[0, 0, 0]]},
-    "/v1/surveys/{survey_id}": {"included": True},
-    "/v1/floors/{floor_id}/outline": OUTLINE,
-    "/v1/buildings/{building_id}/floors:import": {"type": "FeatureCollection", "features": []},
-    "/v1/buildings/{building_id}": {},
-    "/v1/floors/{floor_id}": {},
-    "/v1/tracks/{track_id}/steps": {"steps": [{"number": 0, "t_s": 0.0}]},
-    "/v1/calibrations": {"device": "x", "reference": {"magnitude_ut": 50.0}, "b_ut": [[50.0, 0.0, 0.0]] * 2},
-    "/v1/attitudes": {
-        "t_s": [0.0, 0.1],
-        "gyro_rad_per_s": [[0, 0, 0]] * 2,
-        "accelerometer_m_per_s2": [[0, 0, 9.8]] * 2,
-        "reference": {"kind": "none"},
-    },
-}
-WINDOW = {"window": {"frame": "norm", "b_ut": [50.0], "displacement_m": [[0, 0, 0]]}}
-QUERIES = {
-    "/v1/maps/{map_id}/export": {"format": "csv"},
-    "/v1/floors/{floor_id}/plan": {"metres_per_pixel": "0.1"},
-}
 
 
-def _routes(app: Any) -> list[tuple[str, str]]:
-    schema = app.openapi()
-    return sorted((method.upper(), path) for path, item in schema["paths"].items() for method in item)
-
-
-@pytest.fixture(scope="module")
-def ids(service: Any, building: str, mapped_floor: str, active_map: str) -> dict[str, str]:
-    survey = service.http.get(f"/v1/floors/{mapped_floor}/surveys").json()["items"][0]["id"]
-    job = service.http.get("/v1/jobs", params={"floor_id": mapped_floor}).json()["items"][0]["id"]
-    track = service.http.post("/v1/tracks", json={"floor_ids": [mapped_floor], "frame": "norm"}).json()["id"]
-    readings = [[50.0 * float(c) for c in row] for row in _sphere(200)]
-    calibration = service.http.post(
-        "/v1/calibrations",
-        json={"device": "phone", "method": "ellipsoid", "reference": {"magnitude_ut": 50.0}, "b_ut": readings},
-    ).json()["id"]
-    return {
-        "calibration_id": calibration,
-        "track_id": track,
-        "building_id": building,
-        "floor_id": mapped_floor,
-        "map_id": active_map,
-        "survey_id": survey,
-        "job_id": job,
-    }
-
-
-def _sphere(n: int) -> np.ndarray:
-    """Directions all over the sphere, not quite of one length."""
-    rng = np.random.default_rng(0)
-    v = rng.normal(size=(n, 3))
-    return v / np.linalg.norm(v, axis=1, keepdims=True) + rng.normal(0, 0.001, (n, 3))
-
-
-def _call(http: Any, method: str, path: str, ids: dict[str, str], headers: dict[str, str]) -> Any:
-    url = re.sub(r"{(\w+)}", lambda name: ids[name[1]], path)
-    arguments: dict[str, Any] = {"headers": headers, "params": QUERIES.get(path)}
-    if path.endswith(("/surveys", "floor_id}/replay")) and method == "POST":
-        arguments["content"] = b"t_s\n"
-    elif method in ("POST", "PATCH", "PUT"):
-        body = {"queries": [WINDOW]} if path.endswith(":batch") else WINDOW if path.endswith("locate") else None
-        arguments["json"] = BODIES.get(path, body)
-    return http.request(method, url, **arguments)
-
-
-def test_every_object_of_another_organisation_is_not_found(
-    service: Any, ids: dict[str, str], stranger: dict[str, str]
-) -> None:
-    checked = 0
-    for method, path in _routes(service.app):
-        if "{" not in path:
-            continue
-        answer = _call(service.http, method, path, ids, stranger)
-        assert answer.status_code == 404, f"{method} {path} answered {answer.status_code}: {answer.text[:200]}"
-        assert not any(value in answer.text.replace(answer.request.url.path, "") for value in ()), path
-        checked += 1
-    assert checked >= 25, "the matrix covers the contract"
-
-
-def test_lists_of_another_organisation_are_empty(service: Any, ids: dict[str, str], stranger: dict[str, str]) -> None:
-    for path in ("/v1/buildings", "/v1/jobs", "/v1/tracks", "/v1/calibrations"):
-        assert service.http.get(path).json()["items"]
-        assert service.http.get(path, headers=stranger).json()["items"] == []
+def test_the_same_objects_are_found_by_their_owner(service: Any, ids: dict[str, str]) -> None:
+    """So that it is not for a wrong address that others find nothing."""
+    service.http.put(f"/v1/floors/{ids['floor_id']}/plan", params={"metres_per_pixel": 1}, content=picture())
+    for method, path in routes(service.app):
+        if "{" in path and method == "GET":
+            answer = call(service.http, method, path, ids, {})
+            assert answer.status_code == 200, f"{path} answered {answer.status_code}: {answer.text[:200]}"
 
 
 def test_every_route_but_health_needs_a_key(service: Any, ids: dict[str, str]) -> None:
-    for method, path in _routes(service.app):
-        answer = _call(service.http, method, path, ids, {"Authorization": "Bearer isd_unknown"})
+    for method, path in routes(service.app):
+        answer = call(service.http, method, path, ids, {"Authorization": "Bearer isd_unknown"})
         assert (answer.status_code == 200) if path in OPEN else (answer.status_code == 401), (method, path)
         if path not in OPEN:
             assert answer.headers["www-authenticate"] == "Bearer"
@@ -113,14 +36,30 @@ def test_a_key_does_only_what_its_scopes_say(
     service: Any, ids: dict[str, str], key_with: Callable[..., dict[str, str]]
 ) -> None:
     locating, reading = key_with("locate"), key_with("map:read")
-    for method, path in _routes(service.app):
+    for method, path in routes(service.app):
         if path in OPEN:
             continue
-        answer = _call(service.http, method, path, ids, locating)
+        answer = call(service.http, method, path, ids, locating)
         may = path.endswith(LOCATING) or path.startswith(OF_DEVICES)
         assert (answer.status_code != 403) == may, (method, path, answer.text)
         if method != "GET" and not path.endswith(("/field", "/attitudes")):
-            assert _call(service.http, method, path, ids, reading).status_code == 403, (method, path)
+            assert call(service.http, method, path, ids, reading).status_code == 403, (method, path)
+
+
+def scope_table(app: Any) -> str:
+    """Which scopes open which call, as docs/keys.md shows it; by what the application itself checks."""
+    rows = []
+    for route in sorted((each for each in _served(app) if each.include_in_schema), key=lambda each: each.path):
+        needs = [each.call for each in route.dependant.dependencies if hasattr(each.call, "any_of")]
+        scopes = " or ".join(f"`{scope}`" for scope in needs[0].any_of) if needs else "none: no key is needed"
+        limited = "no" if needs and needs[0].unlimited else "" if needs else "yes"
+        rows += [f"| `{method} {route.path}` | {scopes} | {limited} |" for method in sorted(route.methods)]
+    return "\n".join(rows)
+
+
+def test_the_guide_says_which_scope_opens_what(service: Any) -> None:
+    table = scope_table(service.app)
+    assert table in (Path(__file__).parents[2] / "docs/keys.md").read_text(), f"put this there:\n{table}"
 
 
 def test_lists_are_paged_by_an_opaque_cursor(service: Any, key_with: Callable[..., dict[str, str]]) -> None:
@@ -198,6 +137,27 @@ def test_the_front_door_leads_to_the_page(service: Any, path: str) -> None:
 
 
 def test_all_routes_are_described(service: Any) -> None:
-    described = {path for _, path in _routes(service.app)}
-    served = {route.path for route in service.app.routes if isinstance(route, APIRoute) and route.include_in_schema}
-    assert served <= described
+    described = {path for _, path in routes(service.app)}
+    served = {route.path for route in _served(service.app) if route.include_in_schema}
+    assert served == described
+
+
+def _served(app: Any) -> list[Any]:
+    """Every endpoint; FastAPI keeps those of an included router with that router."""
+    every = [*app.routes, *(each for route in app.routes if hasattr(route, "original_router")
+                            for each in route.original_router.routes)]  # fmt: skip
+    return [route for route in every if isinstance(route, APIRoute)]
+
+
+def test_whoever_is_not_recognised_is_told_the_same(service: Any, key_with: Callable[..., dict[str, str]]) -> None:
+    """A key that never was, one that was revoked and one that has expired cannot be told apart."""
+    told = set()
+    revoked, expired = key_with("map:read", name="revoked"), key_with("map:read", name="expired")
+    with service.context.transaction() as session:
+        session.query(Key).filter_by(name="revoked").one().revoked_at = utc_now()
+        session.query(Key).filter_by(name="expired").one().expires_at = utc_now()
+    for headers in (revoked, expired, {"Authorization": "Bearer isd_guess"}, {"Authorization": "Bearer eyJ.e30.x"}):
+        answer = service.http.get("/v1/buildings", headers=headers)
+        assert answer.status_code == 401
+        told.add((answer.text, answer.headers["www-authenticate"]))
+    assert len(told) == 1

@@ -16,8 +16,11 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Subprotocol
 
+from app.api import auth
 from app.api.track_stream import MOST_AHEAD_BYTES
+from app.db.tables import Key, utc_now
 from app.main import create_app, first_start
+from app.services import key_ring
 from app.services.manage_keys import create_key, revoke_key
 from app.settings import Settings
 
@@ -294,6 +297,27 @@ def test_a_stream_ends_with_its_reason(served: Served, hall_steps: Callable[...,
     assert (told["problem"]["status"], code) == {
         "ended": (409, 4409), "removed": (404, 4404), "revoked": (401, 4401),
     }[why]  # fmt: skip
+
+
+def test_a_stream_on_which_nothing_comes_ends_with_its_key(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auth, "RECHECK_S", 0.2)
+    monkeypatch.setattr(key_ring, "RECENT_S", 0.1)
+    track, context = served.new_track(), served.app.state.context
+    with context.transaction() as session:
+        key = create_key(session, organisation="default", name="idle", scopes=["locate"])
+
+    async def run() -> tuple[dict[str, Any], int | None]:
+        async with served.stream(track, key) as stream:
+            await read(stream)
+            with context.transaction() as session:
+                session.query(Key).filter_by(name="idle").one().expires_at = utc_now()
+            told = await read(stream)
+            with pytest.raises(ConnectionClosed):
+                await read(stream)
+            return told, stream.close_code
+
+    told, code = asyncio.run(run())
+    assert (told["problem"]["status"], code) == (401, 4401)
 
 
 def test_a_client_that_does_not_read_is_slowed_down_and_loses_nothing(

@@ -16,6 +16,7 @@ from app.db.engine import create_database_engine, migrate, session_factory
 from app.db.portable_rows import columns_of, row_as_line, rows_of
 from app.db.snapshot import snapshot
 from app.db.tables import (
+    Audit,
     Base,
     Building,
     Calibration,
@@ -141,6 +142,8 @@ def fill(site: Site) -> None:
         building = Building(organisation_id=owner.id, name=ODD, anchor=anchor)
         session.add_all([key, building])
         session.flush()
+        session.add(Audit(organisation_id=owner.id, actor=ODD, action="building.create", object_id=building.id,
+                          outcome="done", details={"name": ODD}))  # fmt: skip
         plan = {"sha256": put(b"a picture"), "x_m": 0.1}
         floors = [
             Floor(organisation_id=owner.id, building_id=building.id, name=f"{ordinal}", ordinal=ordinal,

@@ -46,6 +46,7 @@ def test_every_command_explains_itself() -> None:
         "view",
         "evaluate",
         "keys",
+        "audit",
         "doctor",
         "openapi",
         "backup",
@@ -70,6 +71,29 @@ def test_keys_are_made_shown_once_listed_and_revoked(data_dir: Path) -> None:
     key_id = next(word for word in listed.output.replace("│", " ").split() if word.count("-") == 4 and len(word) == 36)
     assert runner.invoke(main, ["keys", "revoke", key_id]).exit_code == 0
     assert runner.invoke(main, ["keys", "revoke", "nobody"]).exit_code == 2
+
+
+def test_keys_end_are_rotated_and_all_of_it_is_in_the_log(data_dir: Path) -> None:
+    made = runner.invoke(main, ["keys", "create", "robot", "--scope", "locate", "--expires", "90d"])
+    assert made.exit_code == 0, made.output
+    (line,) = runner.invoke(main, ["audit"]).output.splitlines()
+    row = json.loads(line)
+    assert (row["action"], row["organisation"], row["key_id"]) == ("key.create", "default", None)
+    assert row["actor"].startswith("command line")
+    rotated = runner.invoke(main, ["keys", "rotate", row["object_id"], "--overlap", "90m"])
+    assert rotated.exit_code == 0, rotated.output
+    assert rotated.stdout.startswith("isd_")
+    assert rotated.stdout != made.stdout
+    assert "takes the place of" in rotated.stderr
+    rows = [json.loads(each) for each in runner.invoke(main, ["audit", "--since", "1h"]).output.splitlines()]
+    assert [each["action"] for each in rows] == ["key.create", "key.create", "key.rotate"]
+    assert rows[-1]["details"]["new_key_id"] == rows[1]["object_id"]
+    of_one = runner.invoke(main, ["audit", "--object", row["object_id"], "--action", "key.rotate"]).output.splitlines()
+    assert len(of_one) == 1
+    assert runner.invoke(main, ["audit", "--organisation", "another"]).output == ""
+    assert runner.invoke(main, ["audit", "--since", "2099-01-01"]).output == ""
+    for wrong in (["--expires", "soon"], ["--expires", "2020-01-01"], ["--building", "nowhere"]):
+        assert runner.invoke(main, ["keys", "create", "x", "--scope", "locate", *wrong]).exit_code == 2
 
 
 def test_an_unknown_scope_is_refused_with_the_known_ones(data_dir: Path) -> None:

@@ -20,6 +20,7 @@ from app.services.follow import Follower, Outcome
 from app.services.grid_cache import GridCache
 from app.services.locate_window import ActiveMap
 from app.services.manage_keys import ensure_admin_key
+from app.services.reach import Reach
 from app.services.replay_track import replay_track
 from app.services.track_log import batches_of, delete_track
 from app.services.track_spec import StepKind, Trackers, check_walkable, core_frame, make_spec
@@ -88,7 +89,7 @@ def world(
 def send(follower: Follower, track: Track, steps: Steps, size: int = 10, flush: bool = False) -> list[Outcome]:
     async def run() -> list[Outcome]:
         return [
-            await follower.follow(track.id, track.organisation_id, steps[k : k + size], flush)
+            await follower.follow(track.id, Reach(track.organisation_id), steps[k : k + size], flush)
             for k in range(0, len(steps), size)
         ]
 
@@ -179,8 +180,8 @@ def test_clients_at_once_are_served_in_turn_and_nothing_is_followed_twice(
     steps, track, follower = hall_steps(count=60), world.new_track(), world.follower()
 
     async def run() -> list[Outcome]:
-        asked = [follower.follow(track.id, track.organisation_id, steps[k : k + 10]) for k in range(0, 60, 10)]
-        return await asyncio.gather(*asked, *[follower.follow(track.id, track.organisation_id, steps[:30])])
+        asked = [follower.follow(track.id, Reach(track.organisation_id), steps[k : k + 10]) for k in range(0, 60, 10)]
+        return await asyncio.gather(*asked, *[follower.follow(track.id, Reach(track.organisation_id), steps[:30])])
 
     outcomes = asyncio.run(run())
     assert sum(each.accepted for each in outcomes) == 60

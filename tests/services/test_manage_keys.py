@@ -1,19 +1,24 @@
-"""Keys: recognised by hash, remembered for a moment, useless once revoked."""
+"""Keys: recognised by hash, remembered for a moment, useless once revoked or expired."""
+
+from datetime import timedelta
 
 import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.db.tables import Key
-from app.services import manage_keys
-from app.services.manage_keys import KeyRing, create_key, revoke_key
+from app.db.tables import Audit, Key, utc_now
+from app.errors import Conflict, InvalidInput, NotFound
+from app.services import key_ring
+from app.services.audit_log import COMMAND_LINE
+from app.services.key_ring import KeyRing
+from app.services.manage_keys import create_key, ensure_admin_key, revoke_key, rotate_key
 
 
 def test_a_revoked_key_is_forgotten_within_seconds(
     sessions: sessionmaker[Session], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 100.0
-    monkeypatch.setattr(manage_keys, "monotonic", lambda: now)
+    monkeypatch.setattr(key_ring, "monotonic", lambda: now)
     with sessions.begin() as session:
         secret = create_key(session, organisation="mine", name="robot", scopes=["locate"])
         key_id = session.scalars(select(Key.id).where(Key.name == "robot")).one()
@@ -27,6 +32,73 @@ def test_a_revoked_key_is_forgotten_within_seconds(
     with sessions.begin() as session:
         revoke_key(session, key_id)
     assert ring.recognise(secret) is None
-    now += manage_keys.RECENT_S
+    now += key_ring.RECENT_S
     assert ring.recent(secret) is None
     assert ring.recognise("isd_guess") is None
+
+
+def test_each_process_forgets_by_itself_within_its_two_seconds(
+    sessions: sessionmaker[Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two rings are two processes: neither is told of what the other's revoked, and both know it in time."""
+    now = 100.0
+    monkeypatch.setattr(key_ring, "monotonic", lambda: now)
+    with sessions.begin() as session:
+        secret = create_key(session, organisation="mine", name="two", scopes=["locate"])
+        key_id = session.scalars(select(Key.id).where(Key.name == "two")).one()
+    rings = KeyRing(sessions), KeyRing(sessions)
+    for ring in rings:
+        assert ring.recognise(secret)
+    with sessions.begin() as session:
+        revoke_key(session, key_id)
+    now += key_ring.RECENT_S - 0.01
+    assert all(ring.recent(secret) for ring in rings), "this is the bound that docs/keys.md states"
+    now += 0.01
+    assert not any(ring.recent(secret) or ring.recognise(secret) for ring in rings)
+
+
+def test_an_expired_key_is_not_remembered_past_its_end(
+    sessions: sessionmaker[Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, at = 100.0, utc_now()
+    monkeypatch.setattr(key_ring, "monotonic", lambda: now)
+    monkeypatch.setattr(key_ring, "utc_now", lambda: at)
+    ends = at + timedelta(seconds=0.5)
+    with sessions.begin() as session:
+        secret = create_key(session, organisation="mine", name="short", scopes=["locate"], expires_at=ends)
+    ring = KeyRing(sessions)
+    assert ring.recognise(secret)
+    now += 0.49
+    assert ring.recent(secret)
+    now, at = now + 0.02, ends
+    assert ring.recent(secret) is None
+    assert ring.recognise(secret) is None
+
+
+def test_a_key_is_limited_to_buildings_there_are(sessions: sessionmaker[Session]) -> None:
+    for wrong, error in ((["nowhere"], NotFound), ([], InvalidInput)):
+        with pytest.raises(error), sessions.begin() as session:
+            create_key(session, organisation="mine", name="x", scopes=["locate"], building_ids=wrong)
+
+
+def test_a_subject_of_a_provider_has_no_secret(sessions: sessionmaker[Session]) -> None:
+    """Not even the hash that its row has opens anything; and there is nothing to rotate."""
+    with sessions.begin() as session:
+        secret = create_key(session, organisation="mine", name="plain", scopes=["admin"])
+        row = session.scalars(select(Key).where(Key.name == "plain")).one()
+        row.issuer, row.subject = "https://id.example", "anna"
+        with pytest.raises(Conflict, match="no secret"):
+            rotate_key(session, row, COMMAND_LINE)
+    assert KeyRing(sessions).recognise(secret) is None
+
+
+def test_an_admin_key_of_the_settings_that_has_ended_stops_the_start(sessions: sessionmaker[Session]) -> None:
+    with sessions.begin() as session:
+        ensure_admin_key(session, "isd_of-the-settings")
+    with sessions.begin() as session:
+        ensure_admin_key(session, "isd_of-the-settings")
+        row = session.scalars(select(Key).where(Key.name == "admin (settings)")).one()
+        row.expires_at = utc_now()
+        assert session.scalars(select(Audit.action).where(Audit.object_id == row.id)).all() == ["key.create"]
+    with pytest.raises(InvalidInput, match="has expired"), sessions.begin() as session:
+        ensure_admin_key(session, "isd_of-the-settings")

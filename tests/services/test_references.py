@@ -15,7 +15,8 @@ from app.services.references import CACHES, IN_JSON, NAMING, carried_by_jobs, re
 HASHES_OF_NO_BLOB = {"key.sha256", "track_steps.sha256", "idempotency.fingerprint"}
 
 JSON_WITHOUT_BLOBS = {
-    "key.scopes", "building.anchor", "floor.outline", "calibration.model", "calibration.fit", "calibration.reference",
+    "key.scopes", "key.building_ids", "audit.details",
+    "building.anchor", "floor.outline", "calibration.model", "calibration.fit", "calibration.reference",
     "survey.report", "survey.excluded_s", "map.spec", "map.survey_ids", "map.bounds_m", "map.hyperparameters",
     "map.score", "track.waiting", "track.gaps", "track_steps.settled",
     "job.result",        # the hash of a grid that its map names too; maps are never removed

@@ -24,6 +24,7 @@ from websockets.typing import Origin, Subprotocol
 from app.errors import NotFound
 from app.field.grid import FieldGrid
 from app.field.samples import COMPONENT_NAMES, Components, Samples
+from app.services.reach import Reach
 from app.viewer.page import COOKIE, ViewerApp
 from app.viewer.source import ViewedBuilding, ViewedFloor, ViewedMap, Walk
 
@@ -89,16 +90,18 @@ class MemorySource:
     asked: list[tuple[str, str]] = field(default_factory=list)
     plans: dict[str, bytes] = field(default_factory=dict)
 
-    def buildings(self, organisation_id: str) -> list[ViewedBuilding]:
-        return self.by_organisation.get(organisation_id, [])
+    def buildings(self, reach: Reach) -> list[ViewedBuilding]:
+        return [
+            b for b in self.by_organisation.get(reach.organisation_id, []) if reach.holds(reach.organisation_id, b.id)
+        ]
 
-    def _floors(self, organisation_id: str) -> list[ViewedFloor]:
-        return [f for b in self.buildings(organisation_id) for f in b.floors]
+    def _floors(self, reach: Reach) -> list[ViewedFloor]:
+        return [f for b in self.buildings(reach) for f in b.floors]
 
-    def map(self, organisation_id: str, map_id: str) -> ViewedMap:
+    def map(self, reach: Reach, map_id: str) -> ViewedMap:
         """The maps of a floor are its active one and those named after it: map-0 and map-0-older."""
-        self.asked.append((organisation_id, map_id))
-        mine = {f.map_id: f.id for f in self._floors(organisation_id) if f.map_id}
+        self.asked.append((reach.organisation_id, map_id))
+        mine = {f.map_id: f.id for f in self._floors(reach) if f.map_id}
         active = map_id.removesuffix("-older")
         if active not in mine or map_id not in self.grids:
             raise NotFound(f"no map {map_id}")
@@ -106,15 +109,15 @@ class MemorySource:
         stored = {"coverage": np.ones(grid.measured.shape, np.float32)} if map_id == "map-0" else {}
         return ViewedMap(mine[active], grid, stored)
 
-    def walks(self, organisation_id: str, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
-        self.asked.append((organisation_id, floor_id))
-        if floor_id not in {f.id for f in self._floors(organisation_id)}:
+    def walks(self, reach: Reach, floor_id: str, known: Mapping[str, Walk]) -> list[Walk]:
+        self.asked.append((reach.organisation_id, floor_id))
+        if floor_id not in {f.id for f in self._floors(reach)}:
             raise NotFound(f"no floor {floor_id}")
         return [known.get(walk.survey_id, walk) for walk in self.walks_by_floor.get(floor_id, [])]
 
-    def plan_image(self, organisation_id: str, floor_id: str) -> bytes:
-        self.asked.append((organisation_id, floor_id))
-        if floor_id not in {f.id for f in self._floors(organisation_id) if f.plan is not None}:
+    def plan_image(self, reach: Reach, floor_id: str) -> bytes:
+        self.asked.append((reach.organisation_id, floor_id))
+        if floor_id not in {f.id for f in self._floors(reach) if f.plan is not None}:
             raise NotFound(f"no plan of floor {floor_id}")
         return self.plans[floor_id]
 
@@ -156,7 +159,7 @@ def source() -> MemorySource:
 class Who:
     """An identity as the composition root would give it."""
 
-    organisation_id: str
+    reach: Reach
     scopes: frozenset[str]
 
 
@@ -174,9 +177,10 @@ class KeyRing:
 def keys() -> KeyRing:
     return KeyRing(
         {
-            "north-key": Who("north", frozenset({"map:read"})),
-            "south-key": Who("south", frozenset({"admin"})),
-            "locate-key": Who("north", frozenset({"locate"})),
+            "north-key": Who(Reach("north"), frozenset({"map:read"})),
+            "barn-key": Who(Reach("north", frozenset({"barn"})), frozenset({"map:read"})),
+            "south-key": Who(Reach("south"), frozenset({"admin"})),
+            "locate-key": Who(Reach("north"), frozenset({"locate"})),
         }
     )
 

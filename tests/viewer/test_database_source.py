@@ -11,6 +11,7 @@ from app.db.tables import Base, Building, Floor, Map, Organisation, Survey
 from app.errors import NotFound
 from app.field.samples import Samples
 from app.services.artefacts import grid_to_bytes, samples_to_bytes
+from app.services.reach import Reach
 from app.viewer.database_source import DatabaseViewerSource, rings_of_polygon
 from app.viewer.source import PlacedPlan
 
@@ -67,7 +68,7 @@ def storage(tmp_path, grid_of, walk_of):
 
 def test_buildings_come_with_their_floors_from_the_lowest(storage):
     _, source = storage
-    (building,) = source.buildings("north")
+    (building,) = source.buildings(Reach("north"))
     assert building.name == "House north"
     assert [f.name for f in building.floors] == ["Ground", "First"]
     ground, first = building.floors
@@ -76,7 +77,7 @@ def test_buildings_come_with_their_floors_from_the_lowest(storage):
     np.testing.assert_array_equal(ground.rings_m[0], OUTLINE["coordinates"][0])
     assert first.rings_m == ()
     assert first.elevation_m == 4.0
-    assert source.buildings("nobody") == []
+    assert source.buildings(Reach("nobody")) == []
 
 
 def test_a_map_that_is_not_ready_is_not_offered(storage):
@@ -84,43 +85,54 @@ def test_a_map_that_is_not_ready_is_not_offered(storage):
     with sessions.begin() as session:
         row = session.get_one(Map, "m-north")
         row.status, row.grid_sha256 = "running", None
-    assert source.buildings("north")[0].floors[0].map_id is None
+    assert source.buildings(Reach("north"))[0].floors[0].map_id is None
     with pytest.raises(NotFound):
-        source.map("north", "m-north")
+        source.map(Reach("north"), "m-north")
 
 
 def test_the_grid_and_the_included_walks_are_those_stored(storage, grid_of, walk_of):
     _, source = storage
-    np.testing.assert_array_equal(source.map("north", "m-north").grid.mean_uT, grid_of().mean_uT)
-    assert source.map("north", "m-north").floor_id == "f0-north"
-    (walk,) = source.walks("north", "f0-north", {})
+    np.testing.assert_array_equal(source.map(Reach("north"), "m-north").grid.mean_uT, grid_of().mean_uT)
+    assert source.map(Reach("north"), "m-north").floor_id == "f0-north"
+    (walk,) = source.walks(Reach("north"), "f0-north", {})
     assert (walk.survey_id, walk.name) == ("s0-north", "walk 0")
     np.testing.assert_array_equal(walk.p_building_m, walk_of("a").p_building_m)
-    assert source.walks("north", "f0-north", {walk.survey_id: walk}) == [walk]  # not read again
-    assert source.walks("north", "f1-north", {}) == []
+    assert source.walks(Reach("north"), "f0-north", {walk.survey_id: walk}) == [walk]  # not read again
+    assert source.walks(Reach("north"), "f1-north", {}) == []
+
+
+def test_a_reach_of_other_buildings_finds_nothing(storage):
+    _, source = storage
+    elsewhere = Reach("north", frozenset({"b-south", "b-elsewhere"}))
+    assert source.buildings(elsewhere) == []
+    assert [each.id for each in source.buildings(Reach("north", frozenset({"b-north"})))] == ["b-north"]
+    for ask in (lambda: source.map(elsewhere, "m-north"), lambda: source.walks(elsewhere, "f0-north", {}),
+                lambda: source.plan_image(elsewhere, "f0-north")):  # fmt: skip
+        with pytest.raises(NotFound):
+            ask()
 
 
 def test_another_organisations_objects_are_not_found(storage):
     _, source = storage
     with pytest.raises(NotFound):
-        source.map("north", "m-south")
+        source.map(Reach("north"), "m-south")
     with pytest.raises(NotFound):
-        source.walks("north", "f0-south", {})
+        source.walks(Reach("north"), "f0-south", {})
     with pytest.raises(NotFound):
-        source.walks("north", "no-such-floor", {})
+        source.walks(Reach("north"), "no-such-floor", {})
     with pytest.raises(NotFound):
-        source.plan_image("north", "f0-south")
+        source.plan_image(Reach("north"), "f0-south")
 
 
 def test_a_floor_has_its_plan_and_where_it_lies(storage):
     _, source = storage
-    ground, first = source.buildings("north")[0].floors
+    ground, first = source.buildings(Reach("north"))[0].floors
     assert ground.plan == PlacedPlan(sha256(b"a picture").hexdigest(), 9.0, 6.0, -1.0, 2.0, 0.5)
     assert first.plan is None
-    assert source.plan_image("north", ground.id) == b"a picture"
+    assert source.plan_image(Reach("north"), ground.id) == b"a picture"
     for floor in (first.id, "f0-south"):
         with pytest.raises(NotFound):
-            source.plan_image("north", floor)
+            source.plan_image(Reach("north"), floor)
 
 
 def test_every_ring_of_every_polygon_is_drawn():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.services.reach import Reach
 from app.viewer.page import COOKIE, ViewerApp
 
 
@@ -141,6 +142,18 @@ def test_the_poster_is_the_layer_from_above(running, source):
         theirs = client.get("/view/poster.png?floor=floor-s", headers=cookie)
         own = client.get("/view/poster.png", headers=cookie)
         assert theirs.content == own.content  # a foreign link shows one's own first floor
+
+
+def test_a_key_limited_to_a_building_has_a_page_and_a_server_of_its_own(running):
+    with running.client() as client:
+        for key, buildings in (("north-key", ["Tower", "Barn"]), ("barn-key", ["Barn"])):
+            cookie = {"Cookie": running.cookie(key)}
+            content = client.get("/view/content", headers=cookie).json()
+            assert [each["name"] for each in content["buildings"]] == buildings
+            assert client.get("/view/scene/view-0001", headers=cookie).status_code == 200
+        poster = client.get("/view/poster.png?floor=floor-0", headers=cookie)
+        assert poster.status_code == 204, "there is no map in the barn, and the tower's is not shown"
+    assert set(running.viewer.pool.running()) == {Reach("north"), Reach("north", frozenset({"barn"}))}
 
 
 def test_signing_out_makes_the_cookie_worthless(running):

@@ -10,6 +10,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from app.services.reach import Reach
 from app.viewer.page import ViewerApp
 from app.viewer.proxy import CLOSE_SIGNED_OUT, CLOSE_UNREACHABLE, passes
 
@@ -58,7 +59,7 @@ def test_share_requests_and_controls_never_reach_viser(running, open_page):
         page = open_page(socket)
         running.ask(cookie, "show")
         page.read_until(lambda p: p.labels())
-        server = running.viewer.pool.running()["north"].server
+        server = running.viewer.pool.running()[Reach("north")].server
         page.send({"type": "ShareUrlRequest"})
         page.send({"type": "ShareUrlDisconnect"})
         page.send({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}})
@@ -155,13 +156,13 @@ def test_a_stopped_viser_server_is_replaced(running, open_page):
         page = open_page(socket)
         running.ask(cookie, "show")
         page.read_until(lambda p: p.labels())
-        running.viewer.pool.running()["north"].server.stop()
+        running.viewer.pool.running()[Reach("north")].server.stop()
         with pytest.raises(ConnectionClosed):
             page.read_until(lambda p: False, seconds=10)
     with running.websocket(cookie) as socket, pytest.raises(ConnectionClosed) as closed:  # the browser tries again,
         socket.recv(timeout=10)
     assert closed.value.rcvd.code == CLOSE_UNREACHABLE
-    while "north" in running.viewer.pool.running():
+    while Reach("north") in running.viewer.pool.running():
         time.sleep(0.01)
     with running.websocket(cookie) as socket:  # and again
         page = open_page(socket)
