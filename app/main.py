@@ -7,6 +7,7 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from threading import Thread
+from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
@@ -37,7 +38,6 @@ from app.api import (
     tracks,
 )
 from app.api.access_log import AccessLog
-from app.api.bearer_tokens import BearerTokens
 from app.api.body import BodyLimit
 from app.api.context import Context
 from app.api.problems import Problem, add_problem_handlers
@@ -57,6 +57,9 @@ from app.settings import Settings
 from app.telemetry.facts import ContextExecutor
 from app.viewer.database_source import DatabaseViewerSource
 from app.viewer.page import ViewerApp
+
+if TYPE_CHECKING:
+    from app.api.bearer_tokens import BearerTokens
 
 __all__ = ["create_app", "first_start", "open_context"]
 
@@ -90,7 +93,7 @@ def open_context(settings: Settings) -> Context:
     engine = create_database_engine(settings.resolved_database_url)
     blobs = open_blob_store(settings.resolved_blob_url)
     sessions = session_factory(engine)
-    tokens = None if settings.oidc_issuer is None else BearerTokens(settings)
+    tokens = None if settings.oidc_issuer is None else _open_tokens(settings)
     grids = GridCache(blobs, settings.grid_cache_bytes)
     follows = ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
     return Context(
@@ -114,6 +117,14 @@ def open_context(settings: Settings) -> Context:
         ),
         step_rate=StepRate(settings.max_track_steps_per_s),
     )
+
+
+def _open_tokens(settings: Settings) -> "BearerTokens":
+    from app.api.bearer_tokens import (
+        BearerTokens,  # takes a quarter of a second; few installations need it
+    )
+
+    return BearerTokens(settings)
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:

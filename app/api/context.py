@@ -4,13 +4,12 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, Request
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.api.bearer_tokens import BearerTokens
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
 from app.services.follow import Follower
@@ -18,6 +17,9 @@ from app.services.grid_cache import GridCache
 from app.services.key_ring import KeyRing
 from app.services.step_rate import StepRate
 from app.settings import Settings
+
+if TYPE_CHECKING:
+    from app.api.bearer_tokens import BearerTokens
 
 __all__ = ["Context", "ContextDep", "context_of"]
 
@@ -37,7 +39,7 @@ class Context:
     queue: JobQueue
     grids: GridCache
     keys: KeyRing
-    tokens: BearerTokens | None
+    tokens: "BearerTokens | None"
     searches: Executor
     follows: Executor
     follower: Follower

@@ -23,6 +23,7 @@ from app.db.tables import Key, Organisation
 from app.main import create_app, first_start
 from app.services import key_ring
 from app.settings import Settings
+from app.viewer import sessions
 from tests.api.issuer import AUDIENCE, Issuer, running
 
 ADMIN = {"Authorization": "Bearer isd_admin"}
@@ -256,8 +257,9 @@ def test_weak_and_shared_keys_of_an_issuer_are_not_used(here: Guarded) -> None:
 
 
 def test_the_page_takes_a_token_and_ends_with_it(here: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "RECHECK_SECONDS", 0.1)
     origin = {"Origin": "http://testserver"}
-    token = here.issuer.token(sub="carla", exp=int(time.time()) - 27)  # within the leeway of clocks, for 3 s more
+    token = here.issuer.token(sub="carla", exp=int(time.time()) - 28)  # within the leeway of clocks, for 2 s more
     signed = here.http.post("/view/session", data={"key": token}, headers=origin, follow_redirects=False)
     assert signed.status_code == 303
     until = time.monotonic() + 30
