@@ -169,9 +169,9 @@ def test_everything_works_through_the_proxy_and_outlives_a_web_process_and_a_wor
     upload = http.post(f"/v1/floors/{floor}/surveys", content=walk(0.3))
     installation.kill("worker-0")
     installation.wait_for(upload.json()["job"])
-    told = httpx.get(f"http://127.0.0.1:{installation.metrics_ports[1]}/metrics").text
-    assert "isodyn_workers_taken_over_total 1.0" in told
-    assert 'isodyn_jobs_ended_total{kind="rebuild",outcome="published"}' in told
+    metrics = f"http://127.0.0.1:{installation.metrics_ports[1]}/metrics"
+    patiently(lambda: "isodyn_workers_taken_over_total 1.0" in httpx.get(metrics).text)
+    assert 'isodyn_jobs_ended_total{kind="rebuild",outcome="published"}' in httpx.get(metrics).text
 
 
 def test_a_stranger_who_says_he_is_a_proxy_is_not_believed(tmp_path: Path) -> None:
