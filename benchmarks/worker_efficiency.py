@@ -1,9 +1,9 @@
 """What workers cost beside the work: cores busy, seconds added to each job, latency, and the price of waiting.
 
-Run: python benchmarks/worker_efficiency.py [DATABASE_URL] [--workers 4] [--jobs 60] [--cost 0.5]. Default: SQLite in a
-temporary folder. A job spins `cost` seconds of CPU in its fit's process. This file is also the builder that workers
-load. Shares are of the core seconds that others on the machine left, and what a job adds is how many of them went by
-for each job beyond its cost: work of workers and idle cores alike. With as many workers as cores nothing hides the time
+Run: python benchmarks/worker_efficiency.py [DATABASE_URL] [--workers 4] [--jobs 60] [--cost 0.5]. Default: SQLite in
+a temporary folder. A job spins `cost` seconds of CPU in its fit's process. This file is also the builder that workers
+load. Shares are of the core seconds that others on the machine left. What a job adds is how many of them went by for
+each job beyond its cost: work of workers and idle cores alike. With as many workers as cores nothing hides the time
 between two fits of a slot, which is printed too.
 """
 

@@ -4,6 +4,7 @@ A process of its own, because an engine has one executor id for its life and thi
 """
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -36,6 +37,7 @@ def hand_over(database_url: str, dead_id: str) -> None:
 def main() -> None:
     settings = Settings()
     configure_logs(settings.log_format, settings.log_level)
+    signal.alarm(int(TIMEOUT_S))  # also where whoever started it is dead, and the database away
     order = json.loads(sys.stdin.read())
     DBOS(config=engine_configuration(make_url(order["database_url"]), order["dead_id"]))
     DBOS.listen_queues([])

@@ -47,6 +47,9 @@ LOCKED_OUT = (
     f"for {MIGRATION_PATIENCE_S:.0f} s other transactions held a table it changes. Nothing is lost: end the long ones "
     "(PostgreSQL's view pg_stat_activity has each with its xact_start and query), and start again"
 )
+DEAD_CLIENT = {  # the last is for an answer on its way, where nothing is probed
+    "tcp_keepalives_idle": "10s", "tcp_keepalives_interval": "5s", "tcp_keepalives_count": 3, "tcp_user_timeout": "25s",
+}  # fmt: skip
 HELD_UP = ("55P03", "57014", "40P01")  # PostgreSQL: lock not available, statement timeout, deadlock
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
 
@@ -83,8 +86,8 @@ def create_database_engine(url: str) -> Engine:
 def let_go_of_the_dead(connection: Any, _record: object) -> None:
     """Listener: PostgreSQL ends a transaction, and its locks, 25 s after its client was cut off, not hours."""
     if not isinstance(connection, sqlite3.Connection):
-        for name, value in (("idle", 10), ("interval", 5), ("count", 3)):
-            connection.execute(f"SET tcp_keepalives_{name} = {value}")
+        for name, value in DEAD_CLIENT.items():
+            connection.execute(f"SET {name} = '{value}'")
         connection.commit()
 
 

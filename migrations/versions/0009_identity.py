@@ -24,8 +24,6 @@ NEW_OF_KEY = (
 def upgrade() -> None:
     for name, kind in NEW_OF_KEY:
         op.add_column("key", sa.Column(name, kind, nullable=True))
-    op.create_index("ix_key_organisation_id_issuer_subject", "key", ["organisation_id", "issuer", "subject"],
-                    unique=True)  # fmt: skip
     op.create_table(
         "audit",
         sa.Column("id", sa.String(36), nullable=False),
@@ -50,6 +48,5 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     op.drop_table("audit")
-    op.drop_index("ix_key_organisation_id_issuer_subject", "key")
     for name, _ in reversed(NEW_OF_KEY):
         op.drop_column("key", name)
