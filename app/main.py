@@ -42,6 +42,7 @@ from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
 from app.positioning.locate import warm_up
+from app.services.file_readers import FileReaders
 from app.services.follow import Follower
 from app.services.follow_warm_up import warm_up_tracks
 from app.services.grid_cache import GridCache
@@ -91,6 +92,7 @@ def open_context(settings: Settings) -> Context:
         sessions=sessions,
         blobs=blobs,
         queue=JobQueue(engine),
+        files=FileReaders(settings.parse_processes, settings.parse_memory_bytes, settings.parse_seconds),
         grids=grids,
         metrics=Metrics(),
         keys=KeyRing(sessions),
@@ -121,6 +123,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         sweep.cancel()
         await viewer.close()
         await run_in_threadpool(context.follower.close)
+        await run_in_threadpool(context.files.close)
         await run_in_threadpool(context.queue.close)
         context.engine.dispose()
 

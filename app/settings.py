@@ -37,6 +37,9 @@ class Settings(BaseSettings):
         default=200.0, gt=0, description="most steps of one track a second, sustained; a minute of them at once"
     )
     track_cache_bytes: int = Field(default=512 * 2**20, description="memory for the states of tracks in use")
+    parse_processes: int = Field(default=2, ge=1, le=64, description="foreign files read at one time, a process each")
+    parse_memory_bytes: int = Field(default=2 * 2**30, ge=2**28, description="memory for reading one foreign file")
+    parse_seconds: float = Field(default=120.0, gt=0, le=3600, description="time for reading one foreign file")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
 
     @property

@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session, sessionmaker
 from app.api.metrics import Metrics
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
+from app.services.file_readers import FileReaders
 from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing
@@ -35,6 +36,7 @@ class Context:
     sessions: sessionmaker[Session]
     blobs: BlobStore
     queue: JobQueue
+    files: FileReaders
     grids: GridCache
     metrics: Metrics
     keys: KeyRing

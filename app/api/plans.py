@@ -60,7 +60,7 @@ async def put_plan(
     placement = Placement(metres_per_pixel, x_m, y_m, bearing_rad)
 
     def receive() -> FloorView:
-        plan = place_plan(context.blobs, data, placement)
+        plan = place_plan(context.blobs, data, placement, context.files.picture)
         return _point_to(context, identity, floor_id, plan)
 
     return await run_in_threadpool(receive)

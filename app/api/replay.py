@@ -21,8 +21,8 @@ from app.api.surveys import SURVEY_FILES, SurveyFormat
 from app.db.tables import Floor
 from app.errors import Conflict
 from app.services.calibrations import AppliedCalibration, find_calibration
+from app.services.file_orders import SurveyOrder
 from app.services.locate_window import ActiveMap, active_maps
-from app.services.receive_survey import read_on_floor
 from app.services.replay_walk import Replay, ReplayedFix, replay_walk
 
 __all__ = ["router"]
@@ -85,7 +85,8 @@ async def replay(
     data = await read_upload(request, context.settings.max_upload_bytes)
 
     def begin() -> Replay:
-        walk = read_on_floor(data, format=format, frame=frame, elevation_m=elevation_m, calibration=calibration)
+        correct = None if calibration is None else calibration.model
+        walk = context.files.survey(SurveyOrder(data, format, frame, elevation_m, correct=correct))
         floors = context.grids.searchable([(each.floor_id, each.grid_sha256) for each in maps])
         return replay_walk(walk, floors, window_m, every_m)
 

@@ -193,6 +193,7 @@ async def upload_survey(
             context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
             session=session, calibration=told.calibration,
             at=None if told.anchor is None else (told.anchor, datetime.now(UTC).date()),
+            read=context.files.survey,
         )  # fmt: skip
 
         def create(transaction: Session) -> tuple[int, BaseModel]:

@@ -41,6 +41,7 @@ def serve(
         console.print(f"[bold]Admin key (shown this once, keep it):[/bold] {made}", soft_wrap=True)
     # uvicorn stops gracefully on SIGTERM and then raises it again: let that end here, past the worker's farewell.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    threading.Thread(target=app.state.context.files.start, name="file-readers", daemon=True).start()
     supervisor = WorkerSupervisor() if embedded_worker else None
     if supervisor is not None:
         supervisor.start()
