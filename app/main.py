@@ -5,7 +5,6 @@ import gc
 import logging
 import os
 from collections.abc import AsyncIterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from threading import Thread
 
@@ -34,8 +33,10 @@ from app.api import (
     track_stream,
     tracks,
 )
+from app.api.admission import Admission, BodyMemory
 from app.api.body import BodyLimit
 from app.api.context import Context
+from app.api.key_limits import KeyLimits, KeyLimitsMiddleware
 from app.api.metrics import Metrics, MetricsMiddleware
 from app.api.problems import Problem, add_problem_handlers
 from app.blobs import open_blob_store
@@ -49,6 +50,7 @@ from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing, ensure_admin_key
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
+from app.services.turns import Turns
 from app.settings import Settings
 from app.viewer.database_source import DatabaseViewerSource
 from app.viewer.page import ViewerApp
@@ -85,7 +87,8 @@ def open_context(settings: Settings) -> Context:
     blobs = open_blob_store(settings.resolved_blob_url)
     sessions = session_factory(engine)
     grids = GridCache(blobs, settings.grid_cache_bytes)
-    follows = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
+    threads = min(os.cpu_count() or 1, MOST_SEARCHES)
+    follows = Turns(threads, "follow", settings.max_wait_s)
     return Context(
         settings=settings,
         engine=engine,
@@ -96,8 +99,11 @@ def open_context(settings: Settings) -> Context:
         grids=grids,
         metrics=Metrics(),
         keys=KeyRing(sessions),
-        searches=ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
+        key_limits=KeyLimits(settings.max_requests_per_s, settings.max_requests_per_key, settings.max_streams_per_key),
+        bodies=BodyMemory(settings.body_memory_bytes, settings.max_wait_s),
+        searches=Turns(threads, "search", settings.max_wait_s),
         follows=follows,
+        uploads=Turns(settings.parse_processes, "upload", settings.max_upload_wait_s),
         follower=Follower(
             engine,
             sessions,
@@ -156,7 +162,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     viewer = ViewerApp(context.keys.recognise, DatabaseViewerSource(context.sessions, context.blobs), api=app)
     app.mount("/view", viewer)
     add_problem_handlers(app)
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, streams_itself=_is_upload)
+    # The last one added sees a request first.
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=context.bodies, streams_itself=_is_upload)
+    app.add_middleware(KeyLimitsMiddleware, limits=context.key_limits)
+    app.add_middleware(Admission, most=settings.max_requests)
     app.add_middleware(MetricsMiddleware, metrics=context.metrics)
     _describe_problems(app)
     return app

@@ -27,6 +27,23 @@ class Settings(BaseSettings):
     port: int = Field(default=8300, ge=1, le=65535, description="port to listen on")
     max_upload_bytes: int = Field(default=64 * 2**20, description="largest survey body, before and after decompression")
     max_body_bytes: int = Field(default=4 * 2**20, description="largest JSON body")
+    body_memory_bytes: int = Field(
+        default=512 * 2**20, ge=2**20, description="memory for all bodies that are being received at one time"
+    )
+    max_requests: int = Field(default=500, ge=1, description="most requests open at one time, of all keys together")
+    max_requests_per_key: int = Field(default=200, ge=1, description="most requests of one key open at one time")
+    max_requests_per_s: float = Field(
+        default=1000.0, gt=0, description="most requests of one key a second, sustained; ten seconds' worth at once"
+    )
+    max_streams_per_key: int = Field(
+        default=200, ge=1, description="most WebSocket streams of one key open at one time"
+    )
+    max_wait_s: float = Field(
+        default=2.0, gt=0, description="longest wait for a search, a track's batch, or room for a body; else 503"
+    )
+    max_upload_wait_s: float = Field(
+        default=60.0, gt=0, description="longest wait of a received file to be read; else 503"
+    )
     max_window_samples: int = Field(default=2000, ge=1, le=20_000, description="most samples in one window")
     grid_cache_bytes: int = Field(default=512 * 2**20, description="memory for maps held ready to answer")
     track_idle_timeout_s: float = Field(

@@ -1,6 +1,6 @@
 """What it costs to read surveys in processes of their own: the time against reading them here, and the memory.
 
-`python benchmarks/parse_process.py` prints a ratio per kind and size of file. The largest are at the limit of an upload.
+`python benchmarks/parse_process.py` prints a ratio per kind and size of file; the largest are the largest uploads.
 """
 
 import argparse
@@ -75,7 +75,7 @@ MAKERS: dict[str, Callable[[int], bytes]] = {
 
 def at_the_limit(make: Callable[[int], bytes]) -> bytes:
     sample = make(2000)
-    rows = min(int(0.99 * LIMIT_BYTES / len(sample) * 2000), 1_990_000)
+    rows = min(int(LIMIT_BYTES / len(sample) * 2000), 1_990_000)
     data = make(rows)
     return data if len(data) <= LIMIT_BYTES else make(int(rows * LIMIT_BYTES / len(data) * 0.99))
 

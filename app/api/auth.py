@@ -45,7 +45,10 @@ def _needs(*any_of: str) -> Callable[..., Awaitable[Identity]]:
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
     ) -> Identity:
         secret = None if credentials is None else credentials.credentials
-        return await recognised(await context_of(request), secret, *any_of)
+        context = await context_of(request)
+        identity = await recognised(context, secret, *any_of)
+        context.key_limits.begin(identity.key_id, request.scope)
+        return identity
 
     return check
 

@@ -1,7 +1,6 @@
 """What every endpoint may use, made once by `app.main` and found on the application's state."""
 
 from collections.abc import Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,6 +9,8 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.api.admission import BodyMemory
+from app.api.key_limits import KeyLimits
 from app.api.metrics import Metrics
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
@@ -18,6 +19,7 @@ from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing
 from app.services.step_rate import StepRate
+from app.services.turns import Turns
 from app.settings import Settings
 
 __all__ = ["Context", "ContextDep", "context_of"]
@@ -28,7 +30,7 @@ class Context:
     """The open handles of a web process.
 
     `searches` runs the searches for positions: few at once, the others wait in order of arrival. `follows` is
-    the same for tracks.
+    the same for tracks, `uploads` for files that are received. `bodies` is the memory for what is sent.
     """
 
     settings: Settings
@@ -40,8 +42,11 @@ class Context:
     grids: GridCache
     metrics: Metrics
     keys: KeyRing
-    searches: Executor
-    follows: Executor
+    key_limits: KeyLimits
+    bodies: BodyMemory
+    searches: Turns
+    follows: Turns
+    uploads: Turns
     follower: Follower
     step_rate: StepRate
 

@@ -12,7 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, SurveyReading, SurveyWriting
-from app.api.body import read_upload
+from app.api.body import upload
 from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
@@ -186,9 +186,8 @@ async def upload_survey(
     report.
     """
     told = await run_in_threadpool(_told_of, context, identity, floor_id, replaces, calibration_id, device)
-    data = await read_upload(request, context.settings.max_upload_bytes)
 
-    def receive() -> Response:
+    def receive(data: bytes) -> Response:
         parsed = parse_survey(
             context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
             session=session, calibration=told.calibration,
@@ -204,7 +203,8 @@ async def upload_survey(
 
         return answer_once(context, identity, request, key, parsed.raw_sha256.encode(), create)
 
-    return await run_in_threadpool(receive)
+    async with upload(request, context.settings.max_upload_bytes, context.bodies) as data:
+        return await context.uploads.run(lambda: receive(data), request.is_disconnected)
 
 
 @dataclass(frozen=True, slots=True)
