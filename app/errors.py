@@ -8,6 +8,7 @@
     * NotFound                  no such object, or it belongs to somebody else              (HTTP 404)
     * Conflict                  the object's present state forbids it                       (HTTP 409)
         * QuotaExceeded         the organisation has as many of these as it may
+    * PreconditionFailed        it is not what the caller has seen of it                    (HTTP 412)
     * TooLarge                  more bytes or samples than the limit                        (HTTP 413)
     * TooMany                   more requests or tracks than the limit, for now             (HTTP 429)
     * TooSlow                   a body that comes more slowly than can be waited for         (HTTP 408)
@@ -32,6 +33,7 @@ __all__ = [
     "JobCancelled",
     "NotFound",
     "Overloaded",
+    "PreconditionFailed",
     "QuotaExceeded",
     "TooLarge",
     "TooMany",
@@ -83,6 +85,10 @@ class Conflict(IsodynError):
 
 class QuotaExceeded(Conflict):
     """The organisation has as many of these as it may: delete some, or have the limit raised."""
+
+
+class PreconditionFailed(IsodynError):
+    """It is not what the caller has seen of it."""
 
 
 class TooLarge(IsodynError):

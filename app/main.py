@@ -7,9 +7,11 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from threading import Thread
+from typing import Any
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
+from fastapi.middleware.cors import CORSMiddleware
 from fastapi.responses import RedirectResponse
 from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
@@ -19,6 +21,7 @@ from app.api import (
     attitudes,
     buildings,
     calibrations,
+    contract_page,
     floors,
     health,
     jobs,
@@ -36,18 +39,23 @@ from app.api import (
 from app.api.admission import Admission, BodyMemory
 from app.api.body import BodyLimit
 from app.api.context import Context
+from app.api.entity_tags import EntityTags
+from app.api.headers import SecurityHeaders
 from app.api.key_limits import KeyLimits, KeyLimitsMiddleware
 from app.api.metrics import Metrics, MetricsMiddleware
 from app.api.problems import Problem, add_problem_handlers
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
+from app.errors import IsodynError
 from app.jobs.queue import JobQueue
 from app.positioning.locate import warm_up
 from app.services.file_readers import FileReaders
 from app.services.follow import Follower
 from app.services.follow_warm_up import warm_up_tracks
 from app.services.grid_cache import GridCache
+from app.services.keep_warm import keep_warm
 from app.services.manage_keys import KeyRing, ensure_admin_key
+from app.services.quotas import Quotas
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
 from app.services.turns import Turns
@@ -65,6 +73,7 @@ is. Errors are RFC 9457 problem documents."""
 
 
 MOST_SEARCHES = 4  # at once: a search holds Python's one lock part of its time, so that more only wait for each other
+WARM_EVERY_S = 2.0
 
 
 def first_start(settings: Settings) -> str | None:
@@ -100,6 +109,13 @@ def open_context(settings: Settings) -> Context:
         metrics=Metrics(),
         keys=KeyRing(sessions),
         key_limits=KeyLimits(settings.max_requests_per_s, settings.max_requests_per_key, settings.max_streams_per_key),
+        quotas=Quotas(
+            buildings=settings.max_buildings,
+            floors_per_building=settings.max_floors_per_building,
+            surveys=settings.max_surveys,
+            surveys_per_floor=settings.max_surveys_per_floor,
+            survey_bytes=settings.max_survey_bytes,
+        ),
         bodies=BodyMemory(settings.body_memory_bytes, settings.max_wait_s),
         searches=Turns(threads, "search", settings.max_wait_s),
         follows=follows,
@@ -124,9 +140,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         Thread(target=_get_ready, name="warm-up", daemon=True).start()
-        sweep = asyncio.create_task(_end_idle_tracks(context))
+        tasks = [asyncio.create_task(work(context)) for work in (_end_idle_tracks, _keep_warm)]
         yield
-        sweep.cancel()
+        for task in tasks:
+            task.cancel()
         await viewer.close()
         await run_in_threadpool(context.follower.close)
         await run_in_threadpool(context.files.close)
@@ -135,7 +152,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     context = open_context(settings)
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-                  redirect_slashes=False)  # fmt: skip
+                  redirect_slashes=False, docs_url=None, redoc_url=None)  # fmt: skip
     app.state.context = context
     # `locate` first: routes are tried in order, and a position is asked for far more often than anything else.
     for part in (
@@ -155,6 +172,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         calibrations,
         attitudes,
         jobs,
+        contract_page,
     ):
         app.include_router(part.router)
     for path in ("/", "/view"):
@@ -166,9 +184,23 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=context.bodies, streams_itself=_is_upload)
     app.add_middleware(KeyLimitsMiddleware, limits=context.key_limits)
     app.add_middleware(Admission, most=settings.max_requests)
+    app.add_middleware(EntityTags)
+    app.add_middleware(SecurityHeaders, hsts_s=settings.hsts_s)
+    if settings.cors_origins:
+        app.add_middleware(CORSMiddleware, **_cross_origin(settings.cors_origins))
     app.add_middleware(MetricsMiddleware, metrics=context.metrics)
     _describe_problems(app)
     return app
+
+
+async def _keep_warm(context: Context) -> None:
+    """Every few seconds, as long as the process runs."""
+    while True:
+        await asyncio.sleep(WARM_EVERY_S)
+        try:
+            await run_in_threadpool(keep_warm, context.engine, context.grids)
+        except (SQLAlchemyError, IsodynError) as error:
+            _log.warning("maps were not made ready, which is tried again: %s", error)
 
 
 async def _end_idle_tracks(context: Context) -> None:
@@ -195,6 +227,23 @@ def _get_ready() -> None:
 
 def _to_the_page() -> RedirectResponse:
     return RedirectResponse("/view/")
+
+
+def _cross_origin(origins: str) -> dict[str, Any]:
+    """For browser clients elsewhere: their keys go in a header, so that no cookie is let in."""
+    return {
+        "allow_origins": [origin.strip() for origin in origins.split(",") if origin.strip()],
+        "allow_methods": ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"],
+        "allow_headers": [
+            "Authorization",
+            "Content-Encoding",
+            "Content-Type",
+            "Idempotency-Key",
+            "If-Match",
+            "If-None-Match",
+        ],
+        "expose_headers": ["ETag", "Link", "RateLimit", "RateLimit-Policy", "Retry-After"],
+    }
 
 
 def _is_upload(path: str) -> bool:

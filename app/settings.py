@@ -38,6 +38,11 @@ class Settings(BaseSettings):
     max_streams_per_key: int = Field(
         default=200, ge=1, description="most WebSocket streams of one key open at one time"
     )
+    max_buildings: int = Field(default=1000, ge=1, description="most buildings of one organisation")
+    max_floors_per_building: int = Field(default=300, ge=1, description="most floors of one building")
+    max_surveys: int = Field(default=200_000, ge=1, description="most surveys of one organisation")
+    max_surveys_per_floor: int = Field(default=10_000, ge=1, description="most surveys of one floor")
+    max_survey_bytes: int = Field(default=2**40, ge=1, description="most bytes of survey files of one organisation")
     max_wait_s: float = Field(
         default=2.0, gt=0, description="longest wait for a search, a track's batch, or room for a body; else 503"
     )
@@ -45,6 +50,16 @@ class Settings(BaseSettings):
         default=60.0, gt=0, description="longest wait of a received file to be read; else 503"
     )
     max_window_samples: int = Field(default=2000, ge=1, le=20_000, description="most samples in one window")
+    cors_origins: str = Field(
+        default="",
+        description="origins whose pages may call the API in a browser, separated by commas; none by default",
+    )
+    hsts_s: int = Field(
+        default=0, ge=0, description="seconds for which browsers that came by TLS are told to do so again; 0: not told"
+    )
+    shutdown_s: float = Field(
+        default=20.0, gt=0, le=600, description="time for what is being answered when the server is told to stop"
+    )
     grid_cache_bytes: int = Field(default=512 * 2**20, description="memory for maps held ready to answer")
     track_idle_timeout_s: float = Field(
         default=600.0, gt=0, le=86_400, description="a track ends when no step came for this long"

@@ -68,6 +68,7 @@ def create_building(
                        anchor=body.anchor.model_dump() if body.anchor else None)  # fmt: skip
         session.add(row)
         session.flush()
+        context.quotas.check_buildings(session, identity.organisation_id)
         return 201, show_building(row)
 
     return answer_once(context, identity, request, key, body.model_dump_json().encode(), create)

@@ -18,6 +18,7 @@ from app.services.file_readers import FileReaders
 from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.manage_keys import KeyRing
+from app.services.quotas import Quotas
 from app.services.step_rate import StepRate
 from app.services.turns import Turns
 from app.settings import Settings
@@ -43,6 +44,7 @@ class Context:
     metrics: Metrics
     keys: KeyRing
     key_limits: KeyLimits
+    quotas: Quotas
     bodies: BodyMemory
     searches: Turns
     follows: Turns

@@ -110,6 +110,7 @@ def post_import(
         building = find_own(session, identity, Building, building_id)
         levels = read_levels(body, "/body", _place(building, coordinates))
         imported = import_floors(session, building, levels, storey_height_m)
+        context.quotas.check_floors(session, building.id)
         return 200, ImportView(
             made=[show_floor(floor) for floor in imported.made],
             changed=[show_floor(floor) for floor in imported.changed],

@@ -8,6 +8,7 @@
 | not-found    | 404 | no such object for this key                                                               |
 | conflict     | 409 | the object's present state forbids it                                                     |
 | quota        | 409 | the organisation has as many of these as it may: delete some, or have the limit raised    |
+| changed      | 412 | it is not what `If-Match` names: somebody else changed it                                 |
 | too-slow     | 408 | the body came too slowly                                                                  |
 | too-large    | 413 | more bytes than the limit                                                                 |
 | too-many     | 429 | more requests, tracks, or steps a second, than the limit; Retry-After says when            |
@@ -38,6 +39,7 @@ from app.errors import (
     IsodynError,
     NotFound,
     Overloaded,
+    PreconditionFailed,
     QuotaExceeded,
     TooLarge,
     TooMany,
@@ -83,6 +85,7 @@ _KINDS: dict[type[IsodynError], tuple[int, str, str]] = {
     Conflict: (409, "conflict", "The object's state forbids it"),
     TooLarge: (413, "too-large", "Too large"),
     TooMany: (429, "too-many", "Too many"),
+    PreconditionFailed: (412, "changed", "It was changed meanwhile"),
     TooSlow: (408, "too-slow", "The body came too slowly"),
     Overloaded: (503, "overloaded", "Busy"),
     Unavailable: (503, "unavailable", "Unavailable"),
@@ -120,6 +123,7 @@ ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
     409: _documented("The object's present state forbids it, or the organisation has as many of these as it may"),
     413: _documented("More bytes than the limit"),
     422: _documented("What was sent cannot be used; `errors` says where and why"),
+    412: _documented("It is not what `If-Match` names"),
     429: _documented("More than this key may for now; see Retry-After"),
     503: _documented("Busy, or the database or the blob store cannot be reached; try again after Retry-After"),
 }

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+from math import ceil
 from pathlib import Path
 from typing import Annotated
 
@@ -28,6 +29,7 @@ def serve(
     """Run the API, the page and an embedded worker."""
     import uvicorn
 
+    from app.api.patient_http import PatientHttp
     from app.main import create_app, first_start
 
     settings = read_settings()
@@ -48,7 +50,8 @@ def serve(
     try:
         console.print(f"Isodyn listens on http://{settings.host}:{settings.port} (page: /view/, contract: /docs)")
         uvicorn.run(app, host=settings.host, port=settings.port, log_level="warning", access_log=False,
-                    timeout_graceful_shutdown=10, ws_max_size=2**20, ws_ping_timeout=60)  # fmt: skip
+                    http=PatientHttp, server_header=False, timeout_graceful_shutdown=ceil(settings.shutdown_s),
+                    ws_max_size=2**20, ws_ping_timeout=60)  # fmt: skip
     finally:
         if supervisor is not None:
             supervisor.stop()

@@ -174,6 +174,7 @@ class Survey(Base):
     format: Mapped[str] = mapped_column(String(40))
     frame: Mapped[str] = mapped_column(String(20))
     raw_sha256: Mapped[str] = mapped_column(Sha256)
+    raw_bytes: Mapped[int | None] = mapped_column(BigInteger)
     samples_sha256: Mapped[str] = mapped_column(Sha256)
     sample_count: Mapped[int]
     report: Mapped[dict[str, Any]]

@@ -37,6 +37,7 @@ class ParsedSurvey:
     frame: SampleFrame
     name: str
     raw_sha256: str
+    raw_bytes: int
     samples_sha256: str
     sample_count: int
     report: dict[str, object]
@@ -76,6 +77,7 @@ def parse_survey(
         frame=samples.frame,
         name=name,
         raw_sha256=blobs.put(data),
+        raw_bytes=len(data),
         samples_sha256=blobs.put(samples_to_bytes(samples)),
         sample_count=len(samples),
         report=report,
@@ -191,6 +193,7 @@ def _new_survey(floor: Floor, parsed: ParsedSurvey, replaces: str | None) -> Sur
         format=parsed.format,
         frame=parsed.frame,
         raw_sha256=parsed.raw_sha256,
+        raw_bytes=parsed.raw_bytes,
         samples_sha256=parsed.samples_sha256,
         sample_count=parsed.sample_count,
         report=parsed.report | {"replaces": replaces},

@@ -17,6 +17,7 @@ __all__ = ["RECHECK_SECONDS", "Session", "SignedIn"]
 
 RECHECK_SECONDS = 60.0
 _MOST_SESSIONS = 10_000
+_MOST_SESSIONS_OF_A_KEY = 100  # one more signs the oldest out
 
 
 @dataclass(slots=True, eq=False)
@@ -54,6 +55,9 @@ class SignedIn:
         if identity is None:
             return None
         self._drop_expired()
+        own = [each for each in self._sessions.values() if each.key == key]
+        for oldest in own[: max(len(own) + 1 - _MOST_SESSIONS_OF_A_KEY, 0)]:
+            self.close(oldest)
         now = self._clock()
         session = Session(
             secrets.token_urlsafe(32), key, identity.organisation_id, frozenset(identity.scopes),
