@@ -9,13 +9,24 @@ from pydantic import BaseModel
 
 from app.errors import PreconditionFailed
 
-__all__ = ["SHORTLY", "IfMatch", "check_unchanged", "changing", "immutable", "names_tag", "pointer", "pointer_to"]
+__all__ = [
+    "AT_ONCE",
+    "IfMatch",
+    "check_unchanged",
+    "changing",
+    "immutable",
+    "names_tag",
+    "pointer",
+    "pointer_to",
+    "state",
+]
 
 FOR_EVER = "private, max-age=31536000, immutable"
 IfMatch = Annotated[
     str | None, Header(alias="If-Match", max_length=200, description="the ETag of what is to be changed; else 412")
 ]
 SHORTLY = "private, max-age=5"
+AT_ONCE = "private, no-cache"
 
 
 def immutable(request: Request, tag: str, make: Callable[[], bytes], media_type: str) -> Response:
@@ -31,6 +42,12 @@ def changing(request: Request, tag: str, make: Callable[[], bytes], media_type: 
 def pointer(request: Request, view: BaseModel) -> Response:
     """The state of something that changes, under the hash of that state."""
     return pointer_to(request, view.model_dump_json().encode(), "application/json")
+
+
+def state(request: Request, view: BaseModel) -> Response:
+    """The same, where a change is to be seen at once."""
+    content = view.model_dump_json().encode()
+    return _answer(request, _tag(content), lambda: content, "application/json", AT_ONCE)
 
 
 def pointer_to(request: Request, content: bytes, media_type: str) -> Response:

@@ -8,7 +8,7 @@ from hashlib import sha256
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.caching import SHORTLY, names_tag
+from app.api.caching import AT_ONCE, names_tag
 
 __all__ = ["EntityTags"]
 
@@ -62,7 +62,7 @@ class _Tagging:
         tag = sha256(message.get("body", b"")).hexdigest()
         headers = MutableHeaders(raw=list(start["headers"]))
         headers["ETag"] = f'"{tag}"'
-        headers.setdefault("Cache-Control", SHORTLY)
+        headers.setdefault("Cache-Control", AT_ONCE)
         if not names_tag(self._asked, tag):
             return {**start, "headers": headers.raw}, message
         del headers["content-length"], headers["content-type"]

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, SurveyReading, SurveyWriting
 from app.api.body import upload
-from app.api.caching import IfMatch, check_unchanged, pointer
+from app.api.caching import IfMatch, check_unchanged, state
 from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
@@ -258,7 +258,7 @@ def list_surveys(floor_id: Id, context: ContextDep, identity: SurveyReading, pag
 @router.get("/surveys/{survey_id}", response_model=SurveyView, summary="One survey")
 def get_survey(survey_id: Id, request: Request, context: ContextDep, identity: SurveyReading) -> Response:
     with context.transaction() as session:
-        return pointer(request, show_survey(find_own(session, identity, Survey, survey_id)))
+        return state(request, show_survey(find_own(session, identity, Survey, survey_id)))
 
 
 @router.get("/surveys/{survey_id}/report", summary="What was read, and what the reader assumed")
