@@ -166,7 +166,9 @@ def isodyn_problem(error: IsodynError) -> JSONResponse:
 async def _isodyn_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, IsodynError)
     answer = isodyn_problem(error)
-    if isinstance(error, Unavailable) and not isinstance(error, Overloaded):
+    if isinstance(error, Overloaded):
+        return answer  # there may be many, when there is least time to write of them
+    if isinstance(error, Unavailable):
         _log.warning("%s %s: %s: %s", request.method, request.url.path, error, error.__cause__)
     elif answer.status_code >= 500:
         _tell_the_log(request, error)

@@ -26,7 +26,7 @@ class Turns(ThreadPoolExecutor):
     def __init__(self, threads: int, name: str, longest_wait_s: float) -> None:
         super().__init__(threads, thread_name_prefix=name)
         self._most_at_once, self._longest_wait_s = threads, longest_wait_s
-        self._pending, self._mean_s = 0, 0.0
+        self._pending, self._timed_ones, self._mean_s = 0, 0, 0.0
         self._counting = Lock()
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
@@ -74,7 +74,9 @@ class Turns(ThreadPoolExecutor):
         finally:
             taken_s = monotonic() - start
             with self._counting:  # one that is far slower, the first of all perhaps, says little of the others
-                self._mean_s += _WEIGHT * (min(taken_s, 3.0 * self._mean_s + 0.05) - self._mean_s)
+                self._timed_ones += 1
+                weight = max(_WEIGHT, 1.0 / self._timed_ones)
+                self._mean_s += weight * (min(taken_s, 3.0 * self._mean_s + 0.05) - self._mean_s)
 
     def _done(self, _: Future[Any]) -> None:
         with self._counting:
