@@ -20,6 +20,7 @@ from app.main import create_app, first_start
 from app.services.manage_keys import create_key
 from app.settings import Settings
 from tests.api.conftest import make_walk_csv
+from tests.services.test_file_readers import large_parquet
 
 ADMIN, OTHER = "isd_the-admin-of-limits", "isd_another-key-of-it"
 
@@ -30,7 +31,7 @@ def context(database_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iter
     settings = Settings(
         data_dir=tmp_path_factory.mktemp("data"), database_url=database_url, admin_key=ADMIN, max_buildings=3,
         max_floors_per_building=2, max_surveys_per_floor=2, max_surveys=3, max_requests_per_s=50.0,
-        max_requests_per_key=5,
+        max_requests_per_key=5, parse_memory_bytes=2**28,
     )  # fmt: skip
     first_start(settings)
     application = create_app(settings)
@@ -85,6 +86,25 @@ def test_an_organisation_may_keep_so_much(http: TestClient) -> None:
     survey = http.get(f"/v1/floors/{floors[1]}/surveys").json()["items"][0]["id"]
     assert http.delete(f"/v1/surveys/{survey}").status_code == 204
     assert upload(floors[1], 5).status_code == 202
+
+
+def test_a_file_that_takes_more_memory_than_it_may_is_refused_and_nothing_else(
+    context: tuple[Context, TestClient], http: TestClient
+) -> None:
+    made, _ = context
+    building = http.get("/v1/buildings").json()["items"][0]["id"]
+    floor = http.get(f"/v1/buildings/{building}/floors").json()["items"][0]["id"]
+    before = sum(1 for _ in made.blobs.stored()), len(http.get(f"/v1/floors/{floor}/surveys").json()["items"])
+    survey = http.get(f"/v1/floors/{floor}/surveys").json()["items"][0]["id"]
+    url = f"/v1/floors/{floor}/surveys?replaces={survey}"
+    refused = http.post(f"{url}&format=parquet", content=large_parquet(1_990_000))
+    assert refused.status_code == 422
+    assert refused.json()["type"].endswith("/unreadable-survey")
+    assert any(word in refused.json()["detail"] for word in ("memory", "malloc", "ended the process"))
+    assert before == (
+        sum(1 for _ in made.blobs.stored()), len(http.get(f"/v1/floors/{floor}/surveys").json()["items"]),
+    )  # fmt: skip
+    assert http.post(url, content=make_walk_csv(77, 4.0, 3.0)).status_code == 202
 
 
 def test_survey_files_may_take_so_many_bytes(context: tuple[Context, TestClient], http: TestClient) -> None:
