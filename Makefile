@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install install-dev demo serve test test-slow campaign fuzz lint format benchmarks evaluate evaluate-tracks gallery openapi lock sbom clean
+.PHONY: help install install-dev demo serve test test-slow campaign fuzz lint audit format benchmarks evaluate evaluate-tracks gallery openapi lock sbom clean
 
 help: ## Explain every target
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -52,6 +52,9 @@ lint: install-dev ## Style, types and import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+audit: ## Look for known vulnerabilities of the locked dependencies
+	.ci/audit
 
 format: install-dev ## Format the code
 	$(BIN)/ruff check --fix --select I .

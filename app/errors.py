@@ -7,9 +7,13 @@
         * IncompatibleFrames    a map cannot answer this frame or these components
     * NotFound                  no such object, or it belongs to somebody else              (HTTP 404)
     * Conflict                  the object's present state forbids it                       (HTTP 409)
+        * QuotaExceeded         the organisation has as many of these as it may
+    * PreconditionFailed        it is not what the caller has seen of it                    (HTTP 412)
     * TooLarge                  more bytes or samples than the limit                        (HTTP 413)
     * TooMany                   more requests or tracks than the limit, for now             (HTTP 429)
+    * TooSlow                   a body that comes more slowly than can be waited for         (HTTP 408)
     * Unavailable               what Isodyn itself depends on cannot be reached, for now     (HTTP 503)
+        * Overloaded            more work than can be done soon
     * JobCancelled              a job was asked to stop, and did
     * CorruptArtefact           stored bytes do not match their hash or their format
 
@@ -28,8 +32,12 @@ __all__ = [
     "IsodynError",
     "JobCancelled",
     "NotFound",
+    "Overloaded",
+    "PreconditionFailed",
+    "QuotaExceeded",
     "TooLarge",
     "TooMany",
+    "TooSlow",
     "Unavailable",
     "UnreadableSurvey",
 ]
@@ -75,6 +83,14 @@ class Conflict(IsodynError):
     """The object's present state forbids it."""
 
 
+class QuotaExceeded(Conflict):
+    """The organisation has as many of these as it may: delete some, or have the limit raised."""
+
+
+class PreconditionFailed(IsodynError):
+    """It is not what the caller has seen of it."""
+
+
 class TooLarge(IsodynError):
     """More bytes or samples than the limit."""
 
@@ -93,6 +109,14 @@ class Unavailable(IsodynError):
     def __init__(self, message: str, *faults: Fault, retry_after_s: float = 5.0) -> None:
         super().__init__(message, *faults)
         self.retry_after_s = retry_after_s
+
+
+class Overloaded(Unavailable):
+    """More work than can be done soon; `retry_after_s` says when it may be less."""
+
+
+class TooSlow(IsodynError):
+    """A body that comes more slowly than can be waited for."""
 
 
 class JobCancelled(IsodynError):

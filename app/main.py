@@ -7,12 +7,12 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
+from fastapi.middleware.cors import CORSMiddleware
 from fastapi.responses import RedirectResponse
-from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
 
 from app import __version__
@@ -21,6 +21,7 @@ from app.api import (
     audit,
     buildings,
     calibrations,
+    contract_page,
     floors,
     health,
     jobs,
@@ -38,23 +39,29 @@ from app.api import (
     tracks,
 )
 from app.api.access_log import AccessLog
+from app.api.admission import Admission, BodyMemory
 from app.api.body import BodyLimit
 from app.api.context import Context
+from app.api.entity_tags import EntityTags
+from app.api.headers import SecurityHeaders
+from app.api.key_limits import KeyLimits, KeyLimitsMiddleware
 from app.api.problems import Problem, add_problem_handlers
-from app.api.upkeep import keep_up
+from app.api.upkeep import BACKGROUND
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
 from app.positioning.locate import warm_up
+from app.services.file_readers import FileReaders
 from app.services.follow import Follower
 from app.services.follow_warm_up import warm_up_tracks
 from app.services.grid_cache import GridCache
 from app.services.key_ring import KeyRing
 from app.services.manage_keys import ensure_admin_key
+from app.services.quotas import Quotas
 from app.services.step_rate import StepRate
 from app.services.track_spec import Trackers
+from app.services.turns import Turns
 from app.settings import Settings
-from app.telemetry.facts import ContextExecutor
 from app.viewer.database_source import DatabaseViewerSource
 from app.viewer.page import ViewerApp
 
@@ -95,18 +102,30 @@ def open_context(settings: Settings) -> Context:
     sessions = session_factory(engine)
     tokens = None if settings.oidc_issuer is None else _open_tokens(settings)
     grids = GridCache(blobs, settings.grid_cache_bytes)
-    follows = ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="follow")
+    threads = min(os.cpu_count() or 1, MOST_SEARCHES)
+    follows = Turns(threads, "follow", settings.max_wait_s)
     return Context(
         settings=settings,
         engine=engine,
         sessions=sessions,
         blobs=blobs,
         queue=JobQueue(engine),
+        files=FileReaders(settings.parse_processes, settings.parse_memory_bytes, settings.parse_seconds),
         grids=grids,
         keys=KeyRing(sessions, tokens),
         tokens=tokens,
-        searches=ContextExecutor(min(os.cpu_count() or 1, MOST_SEARCHES), thread_name_prefix="search"),
+        key_limits=KeyLimits(settings.max_requests_per_s, settings.max_requests_per_key, settings.max_streams_per_key),
+        quotas=Quotas(
+            buildings=settings.max_buildings,
+            floors_per_building=settings.max_floors_per_building,
+            surveys=settings.max_surveys,
+            surveys_per_floor=settings.max_surveys_per_floor,
+            survey_bytes=settings.max_survey_bytes,
+        ),
+        bodies=BodyMemory(settings.body_memory_bytes, settings.max_wait_s),
+        searches=Turns(threads, "search", settings.max_wait_s),
         follows=follows,
+        uploads=Turns(settings.parse_processes, "upload", settings.max_upload_wait_s),
         follower=Follower(
             engine,
             sessions,
@@ -135,20 +154,20 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         Thread(target=_get_ready, name="warm-up", daemon=True).start()
-        sweep = asyncio.create_task(_end_idle_tracks(context))
-        upkeep = asyncio.create_task(keep_up(context))
+        tasks = [asyncio.create_task(work(context)) for work in BACKGROUND]
         yield
-        sweep.cancel()
-        upkeep.cancel()
+        for task in tasks:
+            task.cancel()
         await run_in_threadpool(context.keys.note_uses)
         await viewer.close()
         await run_in_threadpool(context.follower.close)
+        await run_in_threadpool(context.files.close)
         await run_in_threadpool(context.queue.close)
         context.engine.dispose()
 
     context = open_context(settings)
     app = FastAPI(title="Isodyn", version=__version__, description=DESCRIPTION, lifespan=lifespan,
-                  redirect_slashes=False,
+                  redirect_slashes=False, docs_url=None, redoc_url=None,
                   # AccessLog makes the span of a request: FastAPI's would tell queries and clients' addresses.
                   telemetry={"tracing": False, "metrics": False, "logs": False})  # fmt: skip
     app.state.context = context
@@ -173,6 +192,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         jobs,
         keys,
         audit,
+        contract_page,
     ):
         app.include_router(part.router)
     for path in ("/", "/view"):
@@ -180,20 +200,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     viewer = ViewerApp(context.keys.recognise, DatabaseViewerSource(context.sessions, context.blobs), api=app)
     app.mount("/view", viewer)
     add_problem_handlers(app)
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, streams_itself=_is_upload)
+    # The last one added sees a request first.
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=context.bodies, streams_itself=_is_upload)
+    app.add_middleware(KeyLimitsMiddleware, limits=context.key_limits)
+    app.add_middleware(Admission, most=settings.max_requests)
+    app.add_middleware(EntityTags)
+    app.add_middleware(SecurityHeaders, hsts_s=settings.hsts_s)
+    if settings.cors_origins:
+        app.add_middleware(CORSMiddleware, **_cross_origin(settings.cors_origins))
     app.add_middleware(AccessLog)
     _describe_problems(app)
     return app
-
-
-async def _end_idle_tracks(context: Context) -> None:
-    """Now and then, as long as the process runs. Whoever asks meanwhile is told by the time, not by this."""
-    while True:
-        await asyncio.sleep(min(60.0, max(context.settings.track_idle_timeout_s / 4.0, 1.0)))
-        try:
-            await run_in_threadpool(context.follower.end_idle)
-        except SQLAlchemyError as error:
-            _log.warning("idle tracks were not ended, which is tried again: %s", error)
 
 
 def _get_ready() -> None:
@@ -210,6 +227,23 @@ def _get_ready() -> None:
 
 def _to_the_page() -> RedirectResponse:
     return RedirectResponse("/view/")
+
+
+def _cross_origin(origins: str) -> dict[str, Any]:
+    """For browser clients elsewhere: their keys go in a header, so that no cookie is let in."""
+    return {
+        "allow_origins": [origin.strip() for origin in origins.split(",") if origin.strip()],
+        "allow_methods": ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"],
+        "allow_headers": [
+            "Authorization",
+            "Content-Encoding",
+            "Content-Type",
+            "Idempotency-Key",
+            "If-Match",
+            "If-None-Match",
+        ],
+        "expose_headers": ["ETag", "Link", "RateLimit", "RateLimit-Policy", "Retry-After"],
+    }
 
 
 def _is_upload(path: str) -> bool:

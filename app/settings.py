@@ -34,7 +34,39 @@ class Settings(BaseSettings):
     port: int = Field(default=8300, ge=1, le=65535, description="port to listen on")
     max_upload_bytes: int = Field(default=64 * 2**20, description="largest survey body, before and after decompression")
     max_body_bytes: int = Field(default=4 * 2**20, description="largest JSON body")
+    body_memory_bytes: int = Field(
+        default=512 * 2**20, ge=2**20, description="memory for all bodies that are being received at one time"
+    )
+    max_requests: int = Field(default=500, ge=1, description="most requests open at one time, of all keys together")
+    max_requests_per_key: int = Field(default=200, ge=1, description="most requests of one key open at one time")
+    max_requests_per_s: float = Field(
+        default=1000.0, gt=0, description="most requests of one key a second, sustained; ten seconds' worth at once"
+    )
+    max_streams_per_key: int = Field(
+        default=200, ge=1, description="most WebSocket streams of one key open at one time"
+    )
+    max_buildings: int = Field(default=1000, ge=1, description="most buildings of one organisation")
+    max_floors_per_building: int = Field(default=300, ge=1, description="most floors of one building")
+    max_surveys: int = Field(default=200_000, ge=1, description="most surveys of one organisation")
+    max_surveys_per_floor: int = Field(default=10_000, ge=1, description="most surveys of one floor")
+    max_survey_bytes: int = Field(default=2**40, ge=1, description="most bytes of survey files of one organisation")
+    max_wait_s: float = Field(
+        default=2.0, gt=0, description="longest wait for a search, a track's batch, or room for a body; else 503"
+    )
+    max_upload_wait_s: float = Field(
+        default=60.0, gt=0, description="longest wait of a received file to be read; else 503"
+    )
     max_window_samples: int = Field(default=2000, ge=1, le=20_000, description="most samples in one window")
+    cors_origins: str = Field(
+        default="",
+        description="origins whose pages may call the API in a browser, separated by commas; none by default",
+    )
+    hsts_s: int = Field(
+        default=0, ge=0, description="seconds for which browsers that came by TLS are told to do so again; 0: not told"
+    )
+    shutdown_s: float = Field(
+        default=20.0, gt=0, le=600, description="time for what is being answered when the server is told to stop"
+    )
     grid_cache_bytes: int = Field(default=512 * 2**20, description="memory for maps held ready to answer")
     track_idle_timeout_s: float = Field(
         default=600.0, gt=0, le=86_400, description="a track ends when no step came for this long"
@@ -57,6 +89,9 @@ class Settings(BaseSettings):
         default="isodyn_buildings", description="claim with the buildings a token is limited to: words, or a list"
     )
     audit_days: int = Field(default=400, ge=1, description="days that rows of the audit log are kept")
+    parse_processes: int = Field(default=2, ge=1, le=64, description="foreign files read at one time, a process each")
+    parse_memory_bytes: int = Field(default=2 * 2**30, ge=2**28, description="memory for reading one foreign file")
+    parse_seconds: float = Field(default=120.0, gt=0, le=3600, description="time for reading one foreign file")
     worker_processes: int = Field(default=1, ge=1, description="child processes fitting maps at one time, per worker")
     trusted_proxies: str = Field(
         default="127.0.0.1,::1",

@@ -108,7 +108,8 @@ class _Needs:
     ) -> Identity:
         secret = None if credentials is None else credentials.credentials
         try:
-            identity = await recognised(await context_of(request), secret, *self.any_of)
+            context = await context_of(request)
+            identity = await recognised(context, secret, *self.any_of)
             if self.unlimited is not None and identity.is_limited:
                 raise Forbidden(f"this key is limited to buildings, and {self.unlimited}; use one that is not")
         except (Unauthorised, Forbidden) as error:
@@ -116,6 +117,7 @@ class _Needs:
             _log.info("refused %s %r from %s: %s", request.method, request.url.path, where, error)
             raise
         request.state.identity = identity
+        context.key_limits.begin(identity.key_id, request.scope)
         return identity
 
 

@@ -9,7 +9,7 @@ from pydantic.config import JsonDict
 from sqlalchemy.orm import Session
 
 from app.api.auth import BuildingMaking, MapWriting, Reading, actor
-from app.api.caching import pointer
+from app.api.caching import IfMatch, check_unchanged, pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
 from app.api.listing import Page, PagingDep, list_page
@@ -68,6 +68,7 @@ def create_building(
                        anchor=body.anchor.model_dump() if body.anchor else None)  # fmt: skip
         session.add(row)
         session.flush()
+        context.quotas.check_buildings(session, identity.organisation_id)
         record(session, actor(request, identity), "create", row)
         return 201, show_building(row)
 
@@ -88,12 +89,14 @@ def get_building(building_id: Id, request: Request, context: ContextDep, identit
 
 @router.patch("/buildings/{building_id}", summary="Change a building's name or anchor")
 def patch_building(
-    building_id: Id, body: BuildingPatch, request: Request, context: ContextDep, identity: MapWriting
-) -> BuildingView:
+    building_id: Id, body: BuildingPatch, request: Request, context: ContextDep, identity: MapWriting,
+    _: IfMatch = None,
+) -> BuildingView:  # fmt: skip
     """What is not given stays. Outlines that came as longitude and latitude were put into building metres by the anchor
     of that time, and do not move with a new one: send them again."""
     with context.transaction() as session:
         row = find_own(session, identity, Building, building_id)
+        check_unchanged(request, show_building(row))
         for name, value in body.model_dump(exclude_unset=True).items():
             setattr(row, name, value)
         session.flush()

@@ -1,6 +1,5 @@
 """Calibrations of a device's magnetometer: make one, list them, compare them. A calibration never changes."""
 
-import asyncio
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
@@ -126,9 +125,8 @@ async def create_calibration(
     if earlier is not None:
         return earlier
     # A search of its own, so in turn with those for positions; it and its readings before the transaction.
-    fit, reference, readings = await asyncio.get_running_loop().run_in_executor(
-        context.searches, calibrate, context.sessions, context.grids, identity.reach, body.asked()
-    )
+    work = partial(calibrate, context.sessions, context.grids, identity.reach, body.asked())
+    fit, reference, readings = await context.searches.run(work, request.is_disconnected)
     samples_sha256 = await run_in_threadpool(keep_readings, context.blobs, readings)
     return await run_in_threadpool(partial(answer_once, context, identity, request, key, raw, create))
 

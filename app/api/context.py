@@ -1,7 +1,6 @@
 """What every endpoint may use, made once by `app.main` and found on the application's state."""
 
 from collections.abc import Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -10,12 +9,17 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.api.admission import BodyMemory
+from app.api.key_limits import KeyLimits
 from app.blobs import BlobStore
 from app.jobs.queue import JobQueue
+from app.services.file_readers import FileReaders
 from app.services.follow import Follower
 from app.services.grid_cache import GridCache
 from app.services.key_ring import KeyRing
+from app.services.quotas import Quotas
 from app.services.step_rate import StepRate
+from app.services.turns import Turns
 from app.settings import Settings
 
 if TYPE_CHECKING:
@@ -29,7 +33,7 @@ class Context:
     """The open handles of a web process.
 
     `searches` runs the searches for positions: few at once, the others wait in order of arrival. `follows` is
-    the same for tracks.
+    the same for tracks, `uploads` for files that are received. `bodies` is the memory for what is sent.
     """
 
     settings: Settings
@@ -37,11 +41,16 @@ class Context:
     sessions: sessionmaker[Session]
     blobs: BlobStore
     queue: JobQueue
+    files: FileReaders
     grids: GridCache
     keys: KeyRing
     tokens: "BearerTokens | None"
-    searches: Executor
-    follows: Executor
+    key_limits: KeyLimits
+    quotas: Quotas
+    bodies: BodyMemory
+    searches: Turns
+    follows: Turns
+    uploads: Turns
     follower: Follower
     step_rate: StepRate
 

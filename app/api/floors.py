@@ -9,7 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.api.auth import MapWriting, Reading, actor
-from app.api.caching import pointer
+from app.api.caching import IfMatch, check_unchanged, pointer
 from app.api.context import ContextDep
 from app.api.idempotency import IdempotencyKey, RawBody, answer_once
 from app.api.listing import Page, PagingDep, list_page
@@ -131,6 +131,7 @@ def create_floor(
                     **body.model_dump(exclude={"outline"}), outline=_read_outline(body.outline))  # fmt: skip
         session.add(row)
         session.flush()
+        context.quotas.check_floors(session, building.id)
         record(session, actor(request, identity), "create", row, building_id=building.id)
         return 201, show_floor(row)
 
@@ -152,7 +153,7 @@ def get_floor(floor_id: Id, request: Request, context: ContextDep, identity: Rea
 
 @router.patch("/floors/{floor_id}", summary="Change a floor")
 def patch_floor(
-    floor_id: Id, body: FloorPatch, request: Request, context: ContextDep, identity: MapWriting
+    floor_id: Id, body: FloorPatch, request: Request, context: ContextDep, identity: MapWriting, _: IfMatch = None
 ) -> FloorView:
     """What is not given stays; null removes `height_m` or `outline`, and is refused elsewhere.
 
@@ -163,6 +164,10 @@ def patch_floor(
     changes = body.model_dump(exclude_unset=True, exclude={"outline"})
     with context.transaction() as session:
         row = find_own(session, identity, Floor, floor_id)
+        if "if-match" in request.headers:
+            lock_floor(session, row.id)
+            session.refresh(row)
+            check_unchanged(request, show_floor(row))
         if "outline" in body.model_fields_set:
             changes["outline"] = _read_outline(body.outline)
         if "elevation_m" in changes:

@@ -20,7 +20,8 @@ class Health(BaseModel):
 
 
 @router.get("/healthz", summary="The process is alive")
-def healthz() -> Health:
+async def healthz() -> Health:
+    """Answered by the event loop itself, however busy the threads are."""
     return Health(status="ok")
 
 

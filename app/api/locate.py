@@ -1,12 +1,11 @@
 """Where am I? A window of magnetometer samples in, a fix out. Nothing is written, nothing queued."""
 
-import asyncio
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from opentelemetry import trace
 from pydantic import BaseModel
 from sqlalchemy import select
@@ -44,47 +43,65 @@ Explain = Annotated[
     "/buildings/{building_id}/locate", response_model=FixView, summary="Locate a window anywhere in a building"
 )
 async def locate_in_building(
-    building_id: Id, body: LocateBody, context: ContextDep, identity: Locating, explain: Explain = False
-) -> Response:
+    building_id: Id, body: LocateBody, request: Request, context: ContextDep, identity: Locating,
+    explain: Explain = False,
+) -> Response:  # fmt: skip
     """Every floor with an active map is searched, or those in `floor_ids`."""
-    return _json(
-        await _in_turn(context, identity, partial(_building_maps, context, identity, building_id), body, explain)
-    )
+    find_maps = partial(_building_maps, context, identity, building_id)
+    return _json(await _in_turn(context, identity, find_maps, request, body, explain))
 
 
 @router.post("/floors/{floor_id}/locate", response_model=FixView, summary="Locate a window on one floor")
 async def locate_on_floor(
-    floor_id: Id, body: LocateBody, context: ContextDep, identity: Locating, explain: Explain = False
-) -> Response:
-    return _json(await _in_turn(context, identity, partial(_floor_maps, context, identity, floor_id), body, explain))
+    floor_id: Id, body: LocateBody, request: Request, context: ContextDep, identity: Locating,
+    explain: Explain = False,
+) -> Response:  # fmt: skip
+    find_maps = partial(_floor_maps, context, identity, floor_id)
+    return _json(await _in_turn(context, identity, find_maps, request, body, explain))
 
 
 @router.post(
     "/buildings/{building_id}/locate:batch", response_model=BatchAnswer, summary="Locate many windows in a building"
 )
 async def locate_batch_in_building(
-    building_id: Id, body: BatchBody, context: ContextDep, identity: Locating
+    building_id: Id, body: BatchBody, request: Request, context: ContextDep, identity: Locating
 ) -> Response:
     find_maps = partial(_building_maps, context, identity, building_id)
-    return _json(BatchAnswer(fixes=[await _in_turn(context, identity, find_maps, query) for query in body.queries]))
+    return _json(await _each_in_turn(context, identity, find_maps, request, body))
 
 
 @router.post("/floors/{floor_id}/locate:batch", response_model=BatchAnswer, summary="Locate many windows on one floor")
-async def locate_batch_on_floor(floor_id: Id, body: BatchBody, context: ContextDep, identity: Locating) -> Response:
+async def locate_batch_on_floor(
+    floor_id: Id, body: BatchBody, request: Request, context: ContextDep, identity: Locating
+) -> Response:
     find_maps = partial(_floor_maps, context, identity, floor_id)
-    return _json(BatchAnswer(fixes=[await _in_turn(context, identity, find_maps, query) for query in body.queries]))
+    return _json(await _each_in_turn(context, identity, find_maps, request, body))
+
+
+FindMaps = Callable[[LocateBody], list[ActiveMap]]
 
 
 async def _in_turn(
-    context: Context, identity: Identity, find_maps: Callable[[LocateBody], list[ActiveMap]], body: LocateBody,
-    explain: bool = False,
+    context: Context, identity: Identity, find_maps: FindMaps, request: Request, body: LocateBody,
+    explain: bool = False, admitted: bool = False,
 ) -> FixView:  # fmt: skip
-    """One window's answer, when its turn comes. A batch queues anew for each of its windows: others come in between."""
+    """One window's answer, when its turn comes. Raises Overloaded where that would take too long."""
     start = perf_counter()
-    loop = asyncio.get_running_loop()
-    return await loop.run_in_executor(
-        context.searches, lambda: _locate(context, identity, find_maps(body), body, start, explain)
-    )
+    return await context.searches.run(
+        lambda: _locate(context, identity, find_maps(body), body, start, explain),
+        request.is_disconnected, admitted,
+    )  # fmt: skip
+
+
+async def _each_in_turn(
+    context: Context, identity: Identity, find_maps: FindMaps, request: Request, body: BatchBody
+) -> BatchAnswer:
+    """A batch queues anew for each of its windows: others come in between. For its key's rate it counts as many."""
+    context.key_limits.take(identity.key_id, len(body.queries) - 1)
+    fixes: list[FixView] = []
+    for query in body.queries:
+        fixes.append(await _in_turn(context, identity, find_maps, request, query, admitted=bool(fixes)))
+    return BatchAnswer(fixes=fixes)
 
 
 def _json(answer: BaseModel) -> Response:

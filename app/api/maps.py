@@ -258,7 +258,13 @@ def get_map(map_id: Id, request: Request, context: ContextDep, identity: Reading
 
 @router.post("/maps/{map_id}/activate", summary="Answer with this map from now on")
 def activate_map(map_id: Id, request: Request, context: ContextDep, identity: MapWriting) -> MapView:
-    """Moves one pointer; works on any finished map of the floor, so it also rolls back."""
+    """Moves one pointer; works on any finished map of the floor, so it also rolls back. Where the floor is searched,
+    the map is made ready first."""
+    with context.transaction() as session:
+        coming = find_own(session, identity, Map, map_id)
+        floor_id, sha256 = coming.floor_id, coming.grid_sha256
+    if sha256 is not None:
+        context.grids.renew({floor_id: sha256})
     with context.transaction() as session:
         row = find_own(session, identity, Map, map_id)
         if row.status != "ready":
@@ -380,7 +386,7 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
     """Every layer at every height, the walks and the outline: needs no server and no network once it is saved."""
     from app.viewer.database_source import rings_of_polygon
     from app.viewer.source import Walk
-    from app.viewer.static_view import static_view_html  # viser is loaded only when somebody looks
+    from app.viewer.static_view import PAGE_POLICY, static_view_html  # viser is loaded only when somebody looks
 
     ready = ready_map(context, identity, map_id)
     with context.transaction() as session:
@@ -397,7 +403,10 @@ def get_view(map_id: Id, request: Request, context: ContextDep, identity: Readin
 
     drawn = [[survey.id for survey in surveys], floor.name, floor.elevation_m, floor.outline]
     shown = sha256_of(json.dumps(drawn).encode()).hexdigest()
-    return immutable(request, ready.tag("view", shown[:16]), page, "text/html")
+    answer = immutable(request, ready.tag("view", shown[:16]), page, "text/html")
+    answer.headers["Content-Security-Policy"] = f"{PAGE_POLICY}; frame-ancestors 'self'"
+    answer.headers["X-Frame-Options"] = "SAMEORIGIN"
+    return answer
 
 
 class ReadyMap(NamedTuple):

@@ -117,6 +117,7 @@ def post_import(
         building = find_own(session, identity, Building, building_id)
         levels = read_levels(body, "/body", _place(building, coordinates))
         imported = import_floors(session, building, levels, storey_height_m)
+        context.quotas.check_floors(session, building.id)
         record(session, actor(request, identity), "import", building, made=[floor.id for floor in imported.made],
                changed=[floor.id for floor in imported.changed])  # fmt: skip
         return 200, ImportView(

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from app.api.auth import Identity, MapWriting, Reading, actor
-from app.api.body import read_upload
+from app.api.body import upload
 from app.api.caching import changing
 from app.api.context import Context, ContextDep
 from app.api.floors import FloorView, show_floor
@@ -57,14 +57,14 @@ async def put_plan(
     there was. A clean copy without metadata is kept, its longest side at most 4096 pixels; its size in metres stays.
     """
     await run_in_threadpool(_check_floor, context, identity, floor_id)
-    data = await read_upload(request, MAX_PLAN_BYTES)
     placement = Placement(metres_per_pixel, x_m, y_m, bearing_rad)
 
-    def receive() -> FloorView:
-        plan = place_plan(context.blobs, data, placement)
+    def receive(data: bytes) -> FloorView:
+        plan = place_plan(context.blobs, data, placement, context.files.picture)
         return _point_to(context, request, identity, floor_id, plan)
 
-    return await run_in_threadpool(receive)
+    async with upload(request, MAX_PLAN_BYTES, context.bodies) as data:
+        return await context.uploads.run(lambda: receive(data), request.is_disconnected)
 
 
 @router.get(

@@ -7,8 +7,12 @@
 | forbidden    | 403 | the key lacks the scope                                                                   |
 | not-found    | 404 | no such object for this key                                                               |
 | conflict     | 409 | the object's present state forbids it                                                     |
+| quota        | 409 | the organisation has as many of these as it may: delete some, or have the limit raised    |
+| changed      | 412 | it is not what `If-Match` names: somebody else changed it                                 |
+| too-slow     | 408 | the body came too slowly                                                                  |
 | too-large    | 413 | more bytes than the limit                                                                 |
-| too-many     | 429 | more tracks, or steps a second, than the limit; Retry-After says when                      |
+| too-many     | 429 | more requests, tracks, or steps a second, than the limit; Retry-After says when            |
+| overloaded   | 503 | more work than can be done soon; nothing was done, Retry-After says when to try again     |
 | unavailable  | 503 | the database or the blob store cannot be reached; Retry-After says when to try again      |
 """
 
@@ -22,6 +26,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from app.api.access_log import REQUEST_ID_HEADER
@@ -34,8 +39,12 @@ from app.errors import (
     InvalidWindow,
     IsodynError,
     NotFound,
+    Overloaded,
+    PreconditionFailed,
+    QuotaExceeded,
     TooLarge,
     TooMany,
+    TooSlow,
     Unavailable,
     UnreadableSurvey,
 )
@@ -44,7 +53,6 @@ from app.telemetry.metrics import PROBLEMS
 
 __all__ = [
     "ERROR_RESPONSES",
-    "TOO_MANY",
     "Forbidden",
     "Problem",
     "Unauthorised",
@@ -76,9 +84,13 @@ _KINDS: dict[type[IsodynError], tuple[int, str, str]] = {
     Unauthorised: (401, "unauthorised", "A key is needed"),
     Forbidden: (403, "forbidden", "The key lacks the scope"),
     NotFound: (404, "not-found", "Not found"),
+    QuotaExceeded: (409, "quota", "The limit is reached"),
     Conflict: (409, "conflict", "The object's state forbids it"),
     TooLarge: (413, "too-large", "Too large"),
     TooMany: (429, "too-many", "Too many"),
+    PreconditionFailed: (412, "changed", "It was changed meanwhile"),
+    TooSlow: (408, "too-slow", "The body came too slowly"),
+    Overloaded: (503, "overloaded", "Busy"),
     Unavailable: (503, "unavailable", "Unavailable"),
     CorruptArtefact: (500, "corrupt-artefact", "Stored data is damaged"),
     IsodynError: (500, "internal", "Something went wrong here"),
@@ -113,13 +125,14 @@ ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
     401: _documented("No key, or one that is not known"),
     403: _documented("The key lacks the scope"),
     404: _documented("No such object for this key"),
-    409: _documented("The object's present state forbids it"),
+    408: _documented("The body came too slowly"),
+    409: _documented("The object's present state forbids it, or the organisation has as many of these as it may"),
     413: _documented("More bytes than the limit"),
     422: _documented("What was sent cannot be used; `errors` says where and why"),
-    503: _documented("The database or the blob store cannot be reached; try again after Retry-After"),
+    412: _documented("It is not what `If-Match` names"),
+    429: _documented("More than this key may for now; see Retry-After"),
+    503: _documented("Busy, or the database or the blob store cannot be reached; try again after Retry-After"),
 }
-
-TOO_MANY: dict[int | str, dict[str, Any]] = {429: _documented("More than the limit for now; see Retry-After")}
 
 
 def problem_response(
@@ -144,6 +157,7 @@ def add_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_exception)
     app.add_exception_handler(OperationalError, _database_unavailable)
+    app.add_exception_handler(PoolTimeout, _connections_taken)
     app.add_exception_handler(DBAPIError, _database_refused)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -160,6 +174,8 @@ def isodyn_problem(error: IsodynError) -> JSONResponse:
 async def _isodyn_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, IsodynError)
     answer = isodyn_problem(error)
+    if isinstance(error, Overloaded):
+        return answer  # there may be many, when there is least time to write of them
     if isinstance(error, Unavailable):
         _log.warning("%s %s: %s: %s", request.method, request.url.path, error, error.__cause__)
     elif answer.status_code >= 500:
@@ -204,6 +220,10 @@ async def _database_unavailable(request: Request, error: Exception) -> JSONRespo
     _log.warning("%s %s: the database cannot be reached: %s", request.method, request.url.path, error)
     detail = "the database cannot be reached now; nothing was stored, try again"
     return problem_response(503, "unavailable", "Unavailable", detail, headers={"Retry-After": "5"})
+
+
+async def _connections_taken(_: Request, __: Exception) -> JSONResponse:
+    return isodyn_problem(Overloaded("every connection to the database is taken; try again", retry_after_s=2.0))
 
 
 async def _database_refused(request: Request, error: Exception) -> JSONResponse:

@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
 from app.api.auth import Identity, Locating
-from app.api.body import read_upload
+from app.api.body import upload
 from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
 from app.api.models import Finite, Id
@@ -21,8 +21,8 @@ from app.api.surveys import SURVEY_FILES, SurveyFormat
 from app.db.tables import Floor
 from app.errors import Conflict
 from app.services.calibrations import AppliedCalibration, find_calibration
+from app.services.file_orders import SurveyOrder
 from app.services.locate_window import ActiveMap, active_maps
-from app.services.receive_survey import read_on_floor
 from app.services.replay_walk import Replay, ReplayedFix, replay_walk
 
 __all__ = ["router"]
@@ -82,14 +82,16 @@ async def replay(
     elevation_m, maps, calibration = await run_in_threadpool(
         _floor_and_maps, context, identity, floor_id, calibration_id, device
     )
-    data = await read_upload(request, context.settings.max_upload_bytes)
 
-    def begin() -> Replay:
-        walk = read_on_floor(data, format=format, frame=frame, elevation_m=elevation_m, calibration=calibration)
+    def begin(data: bytes) -> Replay:
+        correct = None if calibration is None else calibration.model
+        walk = context.files.survey(SurveyOrder(data, format, frame, elevation_m, correct=correct))
         floors = context.grids.searchable([(each.floor_id, each.grid_sha256) for each in maps])
         return replay_walk(walk, floors, window_m, every_m)
 
-    begun = await run_in_threadpool(begin)
+    async with upload(request, context.settings.max_upload_bytes, context.bodies) as data:
+        begun = await context.uploads.run(lambda: begin(data), request.is_disconnected)
+    context.searches.check()
     return StreamingResponse(_lines(context, floor_id, begun), media_type="application/x-ndjson")
 
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from hashlib import sha256
 from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Query, Request, Response
@@ -12,7 +13,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.api.auth import Identity, SurveyReading, SurveyWriting, actor
-from app.api.body import read_upload
+from app.api.body import upload
+from app.api.caching import IfMatch, check_unchanged, state
 from app.api.calibration_request import CalibrationId, DeviceQuery
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
@@ -188,16 +190,17 @@ async def upload_survey(
     report.
     """
     told = await run_in_threadpool(_told_of, context, identity, floor_id, replaces, calibration_id, device)
-    data = await read_upload(request, context.settings.max_upload_bytes)
 
-    UPLOAD_BYTES.observe(len(data))
-
-    def receive() -> Response:
+    def receive(data: bytes) -> Response:
+        UPLOAD_BYTES.observe(len(data))
+        if replaces is None:
+            _check_room(context, floor_id, sha256(data).hexdigest())
         with UPLOAD_PARSE_SECONDS.time(), UPLOADS.labels("refused").count_exceptions(IsodynError):
             parsed = parse_survey(
                 context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
                 session=session, calibration=told.calibration,
                 at=None if told.anchor is None else (told.anchor, datetime.now(UTC).date()),
+                read=context.files.survey,
             )  # fmt: skip
 
         def create(transaction: Session) -> tuple[int, BaseModel]:
@@ -205,6 +208,7 @@ async def upload_survey(
             survey, job, new = record_survey(transaction, context.queue, floor, parsed, replaces)
             UPLOADS.labels("new" if new else "known").inc()
             if new:
+                context.quotas.check_surveys(transaction, floor)
                 record(transaction, actor(request, identity), "upload", survey, ACCEPTED if job else DONE,
                        floor_id=floor.id, replaces=replaces, job_id=job.id if job else None)  # fmt: skip
             view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
@@ -212,7 +216,8 @@ async def upload_survey(
 
         return answer_once(context, identity, request, key, parsed.raw_sha256.encode(), create)
 
-    return await run_in_threadpool(receive)
+    async with upload(request, context.settings.max_upload_bytes, context.bodies) as data:
+        return await context.uploads.run(lambda: receive(data), request.is_disconnected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,6 +227,15 @@ class _Told:
     elevation_m: float
     anchor: Anchor | None
     calibration: AppliedCalibration | None
+
+
+def _check_room(context: Context, floor_id: str, raw_sha256: str) -> None:
+    """Raise QuotaExceeded before anything is stored, but never for a file that is there already."""
+    with context.transaction() as session:
+        floor = session.get_one(Floor, floor_id)
+        there = select(Survey.id).where(Survey.floor_id == floor_id, Survey.raw_sha256 == raw_sha256).limit(1)
+        if session.scalars(there).first() is None:
+            context.quotas.check_surveys(session, floor, coming=1)
 
 
 def _told_of(
@@ -249,10 +263,10 @@ def list_surveys(floor_id: Id, context: ContextDep, identity: SurveyReading, pag
         return list_page(session, select(Survey).where(Survey.floor_id == floor_id), Survey.id, paging, show_survey)
 
 
-@router.get("/surveys/{survey_id}", summary="One survey")
-def get_survey(survey_id: Id, context: ContextDep, identity: SurveyReading) -> SurveyView:
+@router.get("/surveys/{survey_id}", response_model=SurveyView, summary="One survey")
+def get_survey(survey_id: Id, request: Request, context: ContextDep, identity: SurveyReading) -> Response:
     with context.transaction() as session:
-        return show_survey(find_own(session, identity, Survey, survey_id))
+        return state(request, show_survey(find_own(session, identity, Survey, survey_id)))
 
 
 @router.get("/surveys/{survey_id}/report", summary="What was read, and what the reader assumed")
@@ -371,13 +385,14 @@ def get_samples(
 
 @router.patch("/surveys/{survey_id}", summary="Leave a survey out of maps, or take it in again")
 def patch_survey(
-    survey_id: Id, body: SurveyPatch, request: Request, context: ContextDep, identity: SurveyWriting
+    survey_id: Id, body: SurveyPatch, request: Request, context: ContextDep, identity: SurveyWriting, _: IfMatch = None
 ) -> PatchedSurvey:
     disturbed = []
     if "exclude_disturbed" in body.model_fields_set:
         disturbed = [[each.start_s, each.end_s] for each in _disturbances(context, identity, survey_id).stretches]
     with context.transaction() as session:
         survey = _lock_survey(session, identity, survey_id)
+        check_unchanged(request, show_survey(survey))
         before = survey.included, survey.excluded_s or []
         if "included" in body.model_fields_set:
             survey.included = body.included

@@ -53,20 +53,21 @@ class _Message:
 
 @router.websocket("/v1/tracks/{track_id}/stream")
 async def stream(browser: WebSocket, track_id: str) -> None:
-    """Refused before it is opened (HTTP 401, 403, 404, 409 with a problem document), or ready."""
+    """Refused before it is opened (HTTP 401, 403, 404, 409, 429, 503 with a problem document), or ready."""
     context: Context = browser.app.state.context
     secret = _secret(browser)
-    try:
-        _check_origin(browser)
-        identity = browser.state.identity = await recognised(context, secret, "locate")
-        work = partial(_ready, context, identity, track_id)
-        kind, ready = await asyncio.get_running_loop().run_in_executor(context.follows, work)
-    except IsodynError as error:
-        await browser.send_denial_response(isodyn_problem(error))
-        return
-    offered = browser.scope.get("subprotocols", ())
-    await browser.accept(subprotocol=PROTOCOL if PROTOCOL in offered else None)
-    await _Stream(browser, context, secret, track_id, kind).run(ready)
+    with contextlib.ExitStack() as held:
+        try:
+            _check_origin(browser)
+            identity = browser.state.identity = await recognised(context, secret, "locate")
+            held.enter_context(context.key_limits.stream(identity.key_id))
+            kind, ready = await context.follows.run(partial(_ready, context, identity, track_id))
+        except IsodynError as error:
+            await browser.send_denial_response(isodyn_problem(error))
+            return
+        offered = browser.scope.get("subprotocols", ())
+        await browser.accept(subprotocol=PROTOCOL if PROTOCOL in offered else None)
+        await _Stream(browser, context, secret, track_id, kind).run(ready)
 
 
 def _secret(browser: WebSocket) -> str | None:

@@ -22,7 +22,7 @@ from app.api.listing import Page, PagingDep, list_page
 from app.api.locate_request import FloorId
 from app.api.models import Id
 from app.api.ownership import find_own, own
-from app.api.problems import ERROR_RESPONSES, TOO_MANY
+from app.api.problems import ERROR_RESPONSES
 from app.api.track_answer import (
     EstimateView,
     PathView,
@@ -57,7 +57,7 @@ FromStep = Annotated[int, Query(ge=0, le=2**53 - 1, description="the first numbe
 Limit = Annotated[int, Query(ge=1, le=5000, description="most on one page")]
 
 
-@router.post("", status_code=201, response_model=TrackDetail, responses=TOO_MANY, summary="Begin a track")
+@router.post("", status_code=201, response_model=TrackDetail, summary="Begin a track")
 def create_track(
     body: NewTrack, raw: RawBody, request: Request, context: ContextDep, identity: Locating,
     key: IdempotencyKey = None,
@@ -182,10 +182,11 @@ def stop_track(track_id: Id, request: Request, context: ContextDep, identity: Lo
     return _show(context, row)
 
 
-@router.post("/{track_id}/steps", response_model=StepsAnswer, responses=TOO_MANY, summary="Follow steps")
+@router.post("/{track_id}/steps", response_model=StepsAnswer, summary="Follow steps")
 async def post_steps(track_id: Id, body: StepsBody, context: ContextDep, identity: Locating) -> Response:
     """Whole, or not at all: a fault anywhere refuses the batch. Send again what was not answered: a step that was
     followed already is a duplicate, and changes nothing. What is answered is stored."""
+    context.follows.check()
     kind = await run_in_threadpool(_kind_of, context, identity, track_id)
     steps = raw_steps(body, kind)
     wait_s = context.step_rate.take(track_id, len(steps))

@@ -1,4 +1,4 @@
-"""What a web process sees to once a minute, so that no request has to."""
+"""What a web process sees to now and then, so that no request has to."""
 
 import asyncio
 import logging
@@ -7,16 +7,19 @@ from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.exc import SQLAlchemyError
 
 from app.api.context import Context
+from app.errors import IsodynError
 from app.services.audit_log import prune
+from app.services.keep_warm import keep_warm
 
-__all__ = ["keep_up"]
+__all__ = ["BACKGROUND"]
 
 _log = logging.getLogger(__name__)
 EVERY_S = 60.0
+WARM_EVERY_S = 2.0
 
 
 async def keep_up(context: Context) -> None:
-    """Until it is cancelled: keys were used, the log grows old, and so do the keys of an issuer."""
+    """Keys were used, the log grows old, and so do the keys of an issuer."""
     while True:
         try:
             await run_in_threadpool(_once, context)
@@ -31,3 +34,27 @@ def _once(context: Context) -> None:
     context.keys.note_uses()
     with context.transaction() as session:
         prune(session, context.settings.audit_days)
+
+
+async def keep_maps_warm(context: Context) -> None:
+    """A new map of a floor that is asked for is in memory before the next who asks."""
+    while True:
+        await asyncio.sleep(WARM_EVERY_S)
+        try:
+            await run_in_threadpool(keep_warm, context.engine, context.grids)
+        except (SQLAlchemyError, IsodynError) as error:
+            _log.warning("maps were not made ready, which is tried again: %s", error)
+
+
+async def end_idle_tracks(context: Context) -> None:
+    """Whoever asks meanwhile is told by the time, not by this."""
+    while True:
+        await asyncio.sleep(min(60.0, max(context.settings.track_idle_timeout_s / 4.0, 1.0)))
+        try:
+            await run_in_threadpool(context.follower.end_idle)
+        except SQLAlchemyError as error:
+            _log.warning("idle tracks were not ended, which is tried again: %s", error)
+
+
+BACKGROUND = (keep_up, keep_maps_warm, end_idle_tracks)
+"""Each runs as long as the process, until it is cancelled."""

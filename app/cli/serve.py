@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+from math import ceil
 from pathlib import Path
 from typing import Annotated
 
@@ -29,6 +30,7 @@ def serve(
     """Run the API, the page and an embedded worker."""
     import uvicorn
 
+    from app.api.patient_http import PatientHttp
     from app.main import create_app, first_start
 
     settings = read_settings()
@@ -43,14 +45,16 @@ def serve(
         console.print(f"[bold]Admin key (shown this once, keep it):[/bold] {made}", soft_wrap=True)
     # uvicorn stops gracefully on SIGTERM and then raises it again: let that end here, past the worker's farewell.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    threading.Thread(target=app.state.context.files.start, name="file-readers", daemon=True).start()
     supervisor = WorkerSupervisor() if embedded_worker else None
     if supervisor is not None:
         supervisor.start()
     try:
         console.print(f"Isodyn listens on http://{settings.host}:{settings.port} (page: /view/, contract: /docs)")
         uvicorn.run(app, host=settings.host, port=settings.port, log_config=None, log_level="warning", access_log=False,
-                    proxy_headers=True, forwarded_allow_ips=settings.trusted_proxies,
-                    timeout_graceful_shutdown=10, ws_max_size=2**20, ws_ping_timeout=60)  # fmt: skip
+                    http=PatientHttp, server_header=False, proxy_headers=True,
+                    forwarded_allow_ips=settings.trusted_proxies, timeout_graceful_shutdown=ceil(settings.shutdown_s),
+                    ws_max_size=2**20, ws_ping_timeout=60)  # fmt: skip
     finally:
         if supervisor is not None:
             supervisor.stop()

@@ -205,7 +205,10 @@ class Survey(Base):
     stretches of its time that no map is built from, [[start, end], ...], or null."""
 
     __tablename__ = "survey"
-    __table_args__ = (UniqueConstraint("floor_id", "raw_sha256", "format", "frame"),)
+    __table_args__ = (
+        UniqueConstraint("floor_id", "raw_sha256", "format", "frame"),
+        Index("ix_survey_organisation_id_raw_bytes", "organisation_id", "raw_bytes"),
+    )
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)
     organisation_id: Mapped[str] = mapped_column(ForeignKey("organisation.id"))
     floor_id: Mapped[str] = mapped_column(ForeignKey("floor.id"), index=True)
@@ -213,6 +216,7 @@ class Survey(Base):
     format: Mapped[str] = mapped_column(String(40))
     frame: Mapped[str] = mapped_column(String(20))
     raw_sha256: Mapped[str] = mapped_column(Sha256)
+    raw_bytes: Mapped[int | None] = mapped_column(BigInteger)
     samples_sha256: Mapped[str] = mapped_column(Sha256)
     sample_count: Mapped[int]
     report: Mapped[dict[str, Any]]

@@ -1,9 +1,10 @@
 """Maps held ready to answer: an LRU of grids and searchable floors, bounded by bytes, keyed by content hash."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from threading import Lock
+from time import monotonic
 
 from app.blobs import BlobStore
 from app.field.grid import FieldGrid
@@ -22,6 +23,10 @@ __all__ = ["GridCache"]
 _Entry = FieldGrid | SearchableFloor
 _Key = tuple[str, str, bytes]  # floor id ("": the grid itself), hash of the grid, noise of the floor (b"": its own)
 
+IN_USE_S = 600.0
+"""Floors that were searched this lately have their next map made ready before it is asked for."""
+MOST_IN_USE = 1000
+
 
 class GridCache:
     """A grid never changes under its hash, so an entry never goes stale; the least recently used is dropped when full.
@@ -34,6 +39,7 @@ class GridCache:
         self._capacity_bytes = capacity_bytes
         self._entries: OrderedDict[_Key, _Entry] = OrderedDict()
         self._loading: dict[_Key, Future[_Entry]] = {}
+        self._searched: OrderedDict[tuple[str, ...], tuple[float, tuple[str, ...]]] = OrderedDict()
         self._lock = Lock()
 
     def grid(self, sha256: str) -> FieldGrid:
@@ -47,11 +53,47 @@ class GridCache:
 
         Raises NotFound, CorruptArtefact.
         """
-        grids = [self.grid(sha256) for _, sha256 in maps]
+        floor_ids, hashes = tuple(floor_id for floor_id, _ in maps), tuple(sha256 for _, sha256 in maps)
+        self._note(floor_ids, hashes, monotonic())
+        return self._prepared(floor_ids, hashes)
+
+    def searched_floors(self) -> set[str]:
+        """The floors that were searched in the last minutes."""
+        return {floor_id for floor_ids, _ in self._in_use() for floor_id in floor_ids}
+
+    def renew(self, active: Mapping[str, str]) -> int:
+        """Prepare maps (hash of the grid by floor) for the floors among them that are searched; the old ones stay until
+        nobody asks for them. How many sets of floors had a new one. Raises NotFound, CorruptArtefact."""
+        renewed = 0
+        for floor_ids, hashes in self._in_use():
+            new = tuple(active.get(floor_id, sha256) for floor_id, sha256 in zip(floor_ids, hashes, strict=True))
+            if new != hashes:
+                self._prepared(floor_ids, new)
+                with self._lock:
+                    used_at, _ = self._searched.get(floor_ids, (monotonic(), ()))
+                    self._searched[floor_ids] = used_at, new
+                renewed += 1
+        return renewed
+
+    def _in_use(self) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
+        """Floors searched together, and their maps."""
+        since = monotonic() - IN_USE_S
+        with self._lock:
+            return [(floor_ids, hashes) for floor_ids, (at, hashes) in self._searched.items() if at >= since]
+
+    def _note(self, floor_ids: tuple[str, ...], hashes: tuple[str, ...], now: float) -> None:
+        with self._lock:
+            self._searched[floor_ids] = now, hashes
+            self._searched.move_to_end(floor_ids)
+            if len(self._searched) > MOST_IN_USE:
+                self._searched.popitem(last=False)
+
+    def _prepared(self, floor_ids: Sequence[str], hashes: Sequence[str]) -> list[SearchableFloor]:
+        grids = [self.grid(sha256) for sha256 in hashes]
         noise_sd_uT = shared_noise_sd_uT(grids)
         return [
             self._floor(floor_id, sha256, grid, noise_sd_uT)
-            for (floor_id, sha256), grid in zip(maps, grids, strict=True)
+            for floor_id, sha256, grid in zip(floor_ids, hashes, grids, strict=True)
         ]
 
     def _floor(self, floor_id: str, sha256: str, grid: FieldGrid, noise_sd_uT: Array | None) -> SearchableFloor:

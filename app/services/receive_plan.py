@@ -5,9 +5,9 @@ of pictures might stumble over. Order of durability: the blob is on disk before 
 """
 
 import io
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from math import hypot
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from app.blobs import BlobStore
 from app.errors import Fault, InvalidInput, TooLarge
 
-__all__ = ["MAX_PLAN_BYTES", "Placement", "Plan", "place_plan"]
+__all__ = ["LONGEST_SIDE_PX", "MAX_PIXELS", "MAX_PLAN_BYTES", "Picture", "Placement", "Plan", "place_plan", "redraw"]
 
 MAX_PLAN_BYTES = 20 * 2**20
 MAX_PIXELS = 40_000_000
@@ -25,7 +25,16 @@ FARTHEST_M = 10_000.0
 MAGIC = {"PNG": b"\x89PNG\r\n\x1a\n", "JPEG": b"\xff\xd8\xff", "WEBP": b"RIFF"}
 QUALITY = 90  # of WebP; a PNG stays free of loss
 
-_ONE_AT_A_TIME = Lock()  # a decoded picture and its copies take some hundred megabytes
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture drawn anew: its bytes and size in pixels, and that of the picture which was sent."""
+
+    encoded: bytes
+    media_type: str
+    width_px: int
+    height_px: int
+    sent_px: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,27 +66,34 @@ class Plan:
         return asdict(self)
 
 
-def place_plan(blobs: BlobStore, data: bytes, placement: Placement) -> Plan:
-    """Check and store a PNG, JPEG or WebP picture of a floor.
+def redraw(data: bytes) -> Picture:
+    """The pixels of a PNG, JPEG or WebP picture, written anew; some hundred megabytes of memory for a moment.
 
-    Raises InvalidInput for bytes that are no such picture, are damaged or animated, or lie absurdly; TooLarge for more
-    pixels than the limit, before they are decoded. Then nothing is stored.
+    Raises InvalidInput for bytes that are no such picture, are damaged or animated; TooLarge for more pixels than the
+    limit, before they are decoded.
     """
-    with _ONE_AT_A_TIME:
-        image = _decode(data)
-        width_m, height_m = (placement.metres_per_pixel * side for side in image.size)
-        _check_size(width_m, height_m)
-        small = _shrunk(image)
-        media_type = "image/png" if data.startswith(MAGIC["PNG"]) else "image/webp"
-        encoded = _encode(small, media_type)
+    image = _decode(data)
+    small = _shrunk(image)
+    media_type = "image/png" if data.startswith(MAGIC["PNG"]) else "image/webp"
+    return Picture(_encode(small, media_type), media_type, small.width, small.height, image.size)
+
+
+def place_plan(
+    blobs: BlobStore, data: bytes, placement: Placement, redraw: Callable[[bytes], Picture] = redraw
+) -> Plan:
+    """Check and store a picture of a floor. Raises as `redraw`, and InvalidInput for one that would lie absurdly; then
+    nothing is stored."""
+    picture = redraw(data)
+    width_m, height_m = (placement.metres_per_pixel * side for side in picture.sent_px)
+    _check_size(width_m, height_m)
     return Plan(
-        sha256=blobs.put(encoded),
-        media_type=media_type,
-        width_px=small.width,
-        height_px=small.height,
+        sha256=blobs.put(picture.encoded),
+        media_type=picture.media_type,
+        width_px=picture.width_px,
+        height_px=picture.height_px,
         width_m=width_m,
         height_m=height_m,
-        metres_per_pixel=max(width_m, height_m) / max(small.size),
+        metres_per_pixel=max(width_m, height_m) / max(picture.width_px, picture.height_px),
         x_m=placement.x_m,
         y_m=placement.y_m,
         bearing_rad=placement.bearing_rad,

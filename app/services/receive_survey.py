@@ -4,11 +4,11 @@ Order of durability: blobs are on disk before the row that names them, the row b
 worst a blob nobody names.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import date
 from math import degrees
 
-import numpy as np
 from sqlalchemy import and_, or_, select
 from sqlalchemy.orm import Session
 
@@ -22,13 +22,11 @@ from app.jobs.queue import JobQueue, lock_floor
 from app.services.artefacts import samples_to_bytes
 from app.services.calibrations import AppliedCalibration
 from app.services.disturbances import by_itself
+from app.services.file_orders import SurveyOrder, read_on_floor
 from app.survey.earth_check import check_against_earth
-from app.survey.read import read_survey
 from app.survey.walk import Walk
 
-__all__ = ["ParsedSurvey", "find_replaced", "parse_survey", "read_on_floor", "record_survey", "was_replaced"]
-
-DEVICE_HEIGHT_FORMATS = frozenset({"indoor-location-2020"})  # their z is height above the slab, not building z
+__all__ = ["ParsedSurvey", "find_replaced", "parse_survey", "record_survey", "was_replaced"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +37,7 @@ class ParsedSurvey:
     frame: SampleFrame
     name: str
     raw_sha256: str
+    raw_bytes: int
     samples_sha256: str
     sample_count: int
     report: dict[str, object]
@@ -58,16 +57,17 @@ def parse_survey(
     session: str | None = None,
     calibration: AppliedCalibration | None = None,
     at: tuple[Anchor, date] | None = None,
+    read: Callable[[SurveyOrder], Walk] = read_on_floor,
 ) -> ParsedSurvey:
     """Read a survey file and store its bytes and its samples. Raises UnreadableSurvey; then nothing is stored.
 
     The device's `calibration` is applied to its readings; surveys of one calibration share a session, unless it is
-    told. `at` an anchor and a date the walk is checked against the Earth's field.
+    told. `at` an anchor and a date the walk is checked against the Earth's field. `read` says where the file is read.
     """
     if calibration is not None and session is None:
         session = calibration.label
-    walk = read_on_floor(
-        data, format=format, frame=frame, session=session, elevation_m=elevation_m, calibration=calibration
+    walk = read(
+        SurveyOrder(data, format, frame, elevation_m, session, None if calibration is None else calibration.model)
     )
     samples = walk.samples
     told = _told_calibration(calibration) | _earth_check(walk, at)
@@ -77,6 +77,7 @@ def parse_survey(
         frame=samples.frame,
         name=name,
         raw_sha256=blobs.put(data),
+        raw_bytes=len(data),
         samples_sha256=blobs.put(samples_to_bytes(samples)),
         sample_count=len(samples),
         report=report,
@@ -115,25 +116,6 @@ def _earth_check(walk: Walk, at: tuple[Anchor, date] | None) -> dict[str, object
             "findings": list(check.findings),
         },
     }
-
-
-def read_on_floor(
-    data: bytes,
-    *,
-    format: str,
-    frame: SampleFrame,
-    elevation_m: float,
-    session: str | None = None,
-    calibration: AppliedCalibration | None = None,
-) -> Walk:
-    """The walk in a survey file, in building metres on a floor whose slab is at `elevation_m`. Raises UnreadableSurvey,
-    TooLarge."""
-    correct = None if calibration is None else calibration.model.apply
-    walk = read_survey(data, format=format, frame=frame, session=session, correct=correct)
-    if format not in DEVICE_HEIGHT_FORMATS:
-        return walk
-    lifted_m = walk.samples.p_building_m + np.array([0.0, 0.0, elevation_m])
-    return replace(walk, samples=replace(walk.samples, p_building_m=lifted_m))
 
 
 def record_survey(
@@ -211,6 +193,7 @@ def _new_survey(floor: Floor, parsed: ParsedSurvey, replaces: str | None) -> Sur
         format=parsed.format,
         frame=parsed.frame,
         raw_sha256=parsed.raw_sha256,
+        raw_bytes=parsed.raw_bytes,
         samples_sha256=parsed.samples_sha256,
         sample_count=parsed.sample_count,
         report=parsed.report | {"replaces": replaces},

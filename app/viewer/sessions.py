@@ -18,6 +18,7 @@ __all__ = ["RECHECK_SECONDS", "Session", "SignedIn"]
 
 RECHECK_SECONDS = 5.0
 _MOST_SESSIONS = 10_000
+_MOST_SESSIONS_OF_A_KEY = 100  # one more signs the oldest out
 
 
 @dataclass(slots=True, eq=False)
@@ -55,6 +56,9 @@ class SignedIn:
         if identity is None:
             return None
         self._drop_expired()
+        own = [each for each in self._sessions.values() if each.key == key]
+        for oldest in own[: max(len(own) + 1 - _MOST_SESSIONS_OF_A_KEY, 0)]:
+            self.close(oldest)
         now = self._clock()
         session = Session(
             secrets.token_urlsafe(32), key, identity.reach, frozenset(identity.scopes),

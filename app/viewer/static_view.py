@@ -28,10 +28,10 @@ from app.viewer.static_panel import panel_html, radio_label
 from app.viewer.static_scene import DrawnScene, draw_static_scene
 from app.viewer.static_values import LayerPictures, packed_values, thinned_grid
 
-__all__ = ["static_view_html"]
+__all__ = ["PAGE_POLICY", "static_view_html"]
 
 # The file holds everything it needs; this makes the browser refuse anything else.
-_POLICY = (
+PAGE_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
     "img-src data: blob:; font-src data:; connect-src data: blob:; worker-src blob: data:"
 )
@@ -144,7 +144,7 @@ def _assemble(page: str, title: str, panel: str, data: dict[str, object]) -> str
     folder = files("app.viewer") / "assets" / "static"
     style, *scripts = ((folder / name).read_text(encoding="utf-8") for name in ("view.css", *_SCRIPTS))
     head = (
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}" />'
+        f'<meta http-equiv="Content-Security-Policy" content="{PAGE_POLICY}" />'
         f"<style>{style}</style><title>{escape(title)} · Isodyn</title>"
     )
     told = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

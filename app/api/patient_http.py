@@ -1,0 +1,60 @@
+"""HTTP as uvicorn speaks it, for a while: a client that does not finish its headers is hung up on."""
+
+from asyncio import TimerHandle, Transport
+from typing import Any
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+__all__ = ["PatientHttp"]
+
+HEADERS_S = 20.0
+"""From the opening of a connection, or the first byte of a later request, until the end of the headers."""
+MOST_HEADER_BYTES = 65_536
+
+
+class PatientHttp(HttpToolsProtocol):
+    """Headers have `HEADERS_S` and `MOST_HEADER_BYTES`. Bodies are timed where they are read (`app.api.body`)."""
+
+    _hang_up: TimerHandle | None = None
+    _header_bytes = 0
+
+    def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._expect_headers()
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        if self._hang_up is None:
+            self._expect_headers()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self._hang_up is not None:
+            self._header_bytes += len(data)
+            if self._header_bytes > MOST_HEADER_BYTES:
+                self.transport.close()
+
+    def on_headers_complete(self) -> None:
+        self._stop_waiting()
+        super().on_headers_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def shutdown(self) -> None:
+        self._stop_waiting()
+        super().shutdown()
+
+    def _expect_headers(self) -> None:
+        self._header_bytes = 0
+        self._hang_up = self.loop.call_later(HEADERS_S, self._close)
+
+    def _stop_waiting(self) -> None:
+        if self._hang_up is not None:
+            self._hang_up.cancel()
+            self._hang_up = None
+
+    def _close(self, *_: Any) -> None:
+        self._hang_up = None
+        self.transport.close()

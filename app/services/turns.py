@@ -1,0 +1,88 @@
+"""Threads for work that takes a processor: few at once, the others in order of arrival, and no longer queue than helps.
+
+Whoever would wait longer than `longest_wait_s` is told so at once: a queue that only grows serves nobody.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
+from threading import Lock
+from time import monotonic
+from typing import Any, TypeVar
+
+from app.errors import Overloaded
+from app.telemetry.facts import ContextExecutor
+
+__all__ = ["Turns"]
+
+T = TypeVar("T")
+_WEIGHT = 0.1  # of the latest work in the mean time that work takes
+_MOST_WAITING = 2000
+_LOOKS_AFTER_S = 0.05  # of waiting: has the client gone?
+
+
+class Turns(ContextExecutor):
+    """`threads` at work at once. `submit` takes any work; `run` and `check` refuse what would wait too long."""
+
+    def __init__(self, threads: int, name: str, longest_wait_s: float) -> None:
+        super().__init__(threads, thread_name_prefix=name)
+        self._most_at_once, self._longest_wait_s = threads, longest_wait_s
+        self._pending, self._timed_ones, self._mean_s = 0, 0, 0.0
+        self._counting = Lock()
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        with self._counting:
+            self._pending += 1
+        future = super().submit(self._timed, fn, *args, **kwargs)
+        future.add_done_callback(self._done)
+        return future
+
+    @property
+    def expected_wait_s(self) -> float:
+        """How long work that comes now would wait, by how long it took lately."""
+        return max(self._pending + 1 - self._most_at_once, 0) * self._mean_s / self._most_at_once
+
+    def check(self) -> None:
+        """Raise Overloaded when work would wait too long; `retry_after_s` is when what waits will have been done."""
+        wait_s = self.expected_wait_s
+        if wait_s > self._longest_wait_s or self._pending > _MOST_WAITING:
+            raise Overloaded(
+                f"{self._pending} others wait already, about {wait_s:.0f} s; try again later", retry_after_s=wait_s
+            )
+
+    async def run(
+        self, work: Callable[[], T], gone: Callable[[], Awaitable[bool]] | None = None, admitted: bool = False
+    ) -> T:
+        """The work's result, when its turn has come. Raises Overloaded, unless it was `admitted` before, as part of a
+        whole; and when `gone` says that nobody waits for it any more. Then it is not done."""
+        if not admitted:
+            self.check()
+        loop, came = asyncio.get_running_loop(), monotonic()
+
+        def begin() -> T:
+            if gone is not None and monotonic() - came > _LOOKS_AFTER_S:
+                left = asyncio.run_coroutine_threadsafe(_said(gone), loop)
+                if left.result():
+                    raise Overloaded("the client has gone")
+            return work()
+
+        return await loop.run_in_executor(self, begin)
+
+    def _timed(self, fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+        start = monotonic()
+        try:
+            return fn(*args, **kwargs)
+        finally:
+            taken_s = monotonic() - start
+            with self._counting:  # one that is far slower, the first of all perhaps, says little of the others
+                self._timed_ones += 1
+                weight = max(_WEIGHT, 1.0 / self._timed_ones)
+                self._mean_s += weight * (min(taken_s, 3.0 * self._mean_s + 0.05) - self._mean_s)
+
+    def _done(self, _: Future[Any]) -> None:
+        with self._counting:
+            self._pending -= 1
+
+
+async def _said(gone: Callable[[], Awaitable[bool]]) -> bool:
+    return await gone()

@@ -1,0 +1,299 @@
+"""Limits of keys, organisations and the process: what is refused, how it says so, and that it ends."""
+
+import asyncio
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+import app.api.body as body_module
+from app.api.admission import Admission, BodyMemory
+from app.api.body import BodyLimit
+from app.api.context import Context
+from app.api.key_limits import KeyLimits
+from app.db.tables import Floor, Survey
+from app.errors import Overloaded, QuotaExceeded, TooMany
+from app.main import create_app, first_start
+from app.services.manage_keys import create_key
+from app.settings import Settings
+from tests.api.conftest import make_walk_csv
+from tests.services.test_file_readers import large_parquet
+
+ADMIN, OTHER = "isd_the-admin-of-limits", "isd_another-key-of-it"
+
+
+@pytest.fixture(scope="module")
+def context(database_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Context, TestClient]]:
+    """A service with narrow limits."""
+    settings = Settings(
+        data_dir=tmp_path_factory.mktemp("data"), database_url=database_url, admin_key=ADMIN, max_buildings=3,
+        max_floors_per_building=2, max_surveys_per_floor=2, max_surveys=3, max_requests_per_s=50.0,
+        max_requests_per_key=5, parse_memory_bytes=2**28,
+    )  # fmt: skip
+    first_start(settings)
+    application = create_app(settings)
+    made: Context = application.state.context
+    with made.transaction() as session:
+        create_key(session, organisation="default", name="other", scopes=["admin"], secret=OTHER)
+    with TestClient(application, headers={"Authorization": f"Bearer {ADMIN}"}) as http:
+        yield made, http
+
+
+@pytest.fixture
+def http(context: tuple[Context, TestClient]) -> TestClient:
+    context[0].key_limits._uses.clear()  # a full bucket for every test
+    return context[1]
+
+
+def add(http: TestClient, path: str, **body: Any) -> Any:
+    return http.post(path, json=body)
+
+
+def is_quota(answer: Any, words: str) -> bool:
+    told = answer.json()
+    return bool(answer.status_code == 409 and told["type"].endswith("/quota") and words in told["detail"])
+
+
+def test_an_organisation_may_keep_so_much(http: TestClient) -> None:
+    building = add(http, "/v1/buildings", name="A").json()["id"]
+    floors = [add(http, f"/v1/buildings/{building}/floors", name="F", ordinal=k, auto_build=False).json()["id"]
+              for k in (0, 1)]  # fmt: skip
+    assert is_quota(add(http, f"/v1/buildings/{building}/floors", name="F", ordinal=2), "2 floors")
+    level = {"type": "Feature", "feature_type": "level", "properties": {"ordinal": 7, "name": {"en": "Roof"}},
+             "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 9], [0, 0]]]}}  # fmt: skip
+    answer = add(http, f"/v1/buildings/{building}/floors:import", type="FeatureCollection", features=[level])
+    assert is_quota(answer, "2 floors")
+    for name in ("B", "C"):
+        assert add(http, "/v1/buildings", name=name).status_code == 201
+    assert is_quota(add(http, "/v1/buildings", name="D"), "3 buildings")
+
+    def upload(floor: str, seed: int, query: str = "") -> Any:
+        return http.post(f"/v1/floors/{floor}/surveys{query}", content=make_walk_csv(seed, 4.0, 3.0))
+
+    first = upload(floors[0], 1).json()["survey"]["id"]
+    assert upload(floors[0], 2).status_code == 202
+    assert is_quota(upload(floors[0], 3), "2 surveys")
+    assert upload(floors[0], 1).status_code == 200, "what is there already may be sent again"
+    assert upload(floors[0], 3, f"?replaces={first}").status_code == 202, "one comes, one goes"
+    assert upload(floors[1], 4).status_code == 202
+    assert is_quota(upload(floors[1], 5), "3 surveys")
+    blobs = sum(1 for _ in http.app.state.context.blobs.stored())  # type: ignore[attr-defined]
+    assert is_quota(upload(floors[1], 6), "3 surveys")
+    assert sum(1 for _ in http.app.state.context.blobs.stored()) == blobs, "nothing of it is stored"  # type: ignore[attr-defined]
+    survey = http.get(f"/v1/floors/{floors[1]}/surveys").json()["items"][0]["id"]
+    assert http.delete(f"/v1/surveys/{survey}").status_code == 204
+    assert upload(floors[1], 5).status_code == 202
+
+
+def test_a_file_that_takes_more_memory_than_it_may_is_refused_and_nothing_else(
+    context: tuple[Context, TestClient], http: TestClient
+) -> None:
+    made, _ = context
+    building = http.get("/v1/buildings").json()["items"][0]["id"]
+    floor = http.get(f"/v1/buildings/{building}/floors").json()["items"][0]["id"]
+    before = sum(1 for _ in made.blobs.stored()), len(http.get(f"/v1/floors/{floor}/surveys").json()["items"])
+    survey = http.get(f"/v1/floors/{floor}/surveys").json()["items"][0]["id"]
+    url = f"/v1/floors/{floor}/surveys?replaces={survey}"
+    refused = http.post(f"{url}&format=parquet", content=large_parquet(1_990_000))
+    assert refused.status_code == 422
+    assert refused.json()["type"].endswith("/unreadable-survey")
+    assert any(word in refused.json()["detail"] for word in ("memory", "malloc", "ended the process"))
+    assert before == (
+        sum(1 for _ in made.blobs.stored()), len(http.get(f"/v1/floors/{floor}/surveys").json()["items"]),
+    )  # fmt: skip
+    assert http.post(url, content=make_walk_csv(77, 4.0, 3.0)).status_code == 202
+
+
+def test_survey_files_may_take_so_many_bytes(context: tuple[Context, TestClient], http: TestClient) -> None:
+    made, _ = context
+    with made.transaction() as session:
+        floor = session.query(Floor).first()
+        assert floor is not None
+        size = sum(survey.raw_bytes or 0 for survey in session.query(Survey))
+        assert size > 0
+        replace(made.quotas, survey_bytes=size).check_surveys(session, floor)
+        with pytest.raises(QuotaExceeded, match="would be more than"):
+            replace(made.quotas, survey_bytes=size - 1).check_surveys(session, floor)
+
+
+def test_a_key_that_asks_too_often_is_told_when_it_may(http: TestClient) -> None:
+    answers = [http.get("/v1/buildings") for _ in range(2)]
+    left = [int(each.headers["RateLimit"].split(";")[1].removeprefix("r=")) for each in answers]
+    assert left[0] == 499
+    assert 498 <= left[1] <= 499
+    assert answers[0].headers["RateLimit-Policy"] == '"requests";q=500;w=10'
+    limits: KeyLimits = http.app.state.context.key_limits  # type: ignore[attr-defined]
+    (use,) = limits._uses.values()
+    use.left = -50.0
+    refused = http.get("/v1/buildings")
+    assert refused.status_code == 429
+    assert refused.json()["type"].endswith("/too-many")
+    assert refused.headers["Retry-After"] in ("1", "2")
+    other = {"Authorization": f"Bearer {OTHER}"}
+    assert http.get("/v1/buildings", headers=other).status_code == 200, "other keys are not affected"
+    assert use.requests == 0, "the refused one has ended, too"
+
+
+def test_a_batch_counts_as_its_windows(http: TestClient) -> None:
+    building = http.get("/v1/buildings").json()["items"][0]["id"]
+    window = {"frame": "norm", "noise_ut": 0.5, "b_ut": [48.0, 49.0, 50.0],
+              "displacement_m": [[0, 0, 0], [1, 0, 0], [2, 0, 0]]}  # fmt: skip
+    before = http.post(f"/v1/buildings/{building}/locate", json={"window": window})
+    batch = http.post(f"/v1/buildings/{building}/locate:batch", json={"queries": [{"window": window}] * 20})
+    assert batch.status_code == 200, batch.text
+    left = [int(each.headers["RateLimit"].split(";")[1].removeprefix("r=")) for each in (before, batch)]
+    assert 15 <= left[0] - left[1] <= 20
+
+
+def limits(**more: Any) -> tuple[KeyLimits, list[float]]:
+    now = [100.0]
+    return KeyLimits(**{"per_s": 2.0, "requests": 3, "streams": 2, **more}, clock=lambda: now[0]), now
+
+
+def test_a_bucket_empties_and_fills() -> None:
+    made, now = limits()
+    for _ in range(20):
+        scope: dict[str, Any] = {}
+        made.begin("a", scope)
+        made.end(scope)
+    with pytest.raises(TooMany) as refused:
+        made.begin("a", {})
+    assert refused.value.retry_after_s == pytest.approx(0.5)
+    made.begin("b", {})
+    now[0] += 0.5
+    made.end(scope := {"isodyn.key": made._uses["a"]})
+    made.begin("a", scope)
+    assert made.headers(scope)[1] == (b"ratelimit", b'"requests";r=0;t=10')
+
+
+def test_so_many_requests_and_streams_are_open_at_one_time() -> None:
+    made, _ = limits()
+    open_ones: list[dict[str, Any]] = [{} for _ in range(3)]
+    for scope in open_ones:
+        made.begin("a", scope)
+    refused: dict[str, Any] = {}
+    with pytest.raises(TooMany, match="3 requests open"):
+        made.begin("a", refused)
+    made.end(refused)
+    made.end(open_ones[0])
+    made.begin("a", {})
+    with made.stream("a"), made.stream("a"):
+        with pytest.raises(TooMany, match="2 streams open"), made.stream("a"):
+            pass
+        with made.stream("b"):
+            pass
+    with made.stream("a"):
+        pass
+
+
+Messages = list[dict[str, Any]]
+
+
+async def exchange(application: Any, messages: Messages, path: str = "/v1/x", never_ends: bool = False) -> Messages:
+    sent: Messages = []
+
+    async def receive() -> dict[str, Any]:
+        if not messages and never_ends:
+            await asyncio.sleep(60)
+        return messages.pop(0)
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    await application({"type": "http", "path": path, "method": "POST", "headers": []}, receive, send)
+    return sent
+
+
+async def ok(scope: Any, receive: Callable[[], Any], send: Callable[[Any], Any]) -> None:
+    await receive()
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body"})
+
+
+def part(size: int, more: bool = False) -> dict[str, Any]:
+    return {"type": "http.request", "body": b"x" * size, "more_body": more}
+
+
+def test_a_body_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(body_module, "PATIENCE_S", 0.05)
+    limit = BodyLimit(ok, 1000, BodyMemory(10_000, 1.0), lambda path: False)
+    sent = asyncio.run(exchange(limit, [part(10, more=True)], never_ends=True))
+    assert sent[0]["status"] == 408
+
+
+def test_bodies_share_so_much_memory_and_give_it_back() -> None:
+    memory = BodyMemory(200_000, 0.05)
+    limit = BodyLimit(ok, 10**6, memory, lambda path: False)
+
+    async def scenario() -> list[int]:
+        statuses = [(await exchange(limit, [part(150_000)]))[0]["status"]]
+        async with memory.room(100_000):
+            statuses.append((await exchange(limit, [part(80_000, True), part(80_000)]))[0]["status"])
+            statuses.append((await exchange(limit, [part(1000)]))[0]["status"])
+        statuses.append((await exchange(limit, [part(150_000)]))[0]["status"])
+        return statuses
+
+    assert asyncio.run(scenario()) == [200, 503, 200, 200]
+
+
+def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
+    async def scenario() -> None:
+        memory = BodyMemory(100, 5.0)
+        order: list[str] = []
+
+        async def upload(name: str, size: int) -> None:
+            async with memory.room(size):
+                order.append(name)
+                await asyncio.sleep(0.01)
+
+        tasks = [asyncio.create_task(upload(name, size)) for name, size in (("a", 80), ("b", 90), ("c", 10))]
+        await asyncio.sleep(0)
+        cancelled = asyncio.create_task(upload("never", 100))
+        await asyncio.sleep(0.001)
+        cancelled.cancel()
+        await asyncio.gather(*tasks)
+        assert order == ["a", "b", "c"], "a small one does not overtake"
+        async with memory.room(10**9):
+            hasty = BodyMemory(100, 0.01)
+            async with hasty.room(60):
+                with pytest.raises(Overloaded):
+                    async with hasty.room(60):
+                        pass
+                async with hasty.room(40):
+                    pass
+
+    asyncio.run(scenario())
+
+
+def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None:
+    async def scenario() -> None:
+        enough = asyncio.Event()
+
+        async def slow(scope: Any, receive: Any, send: Any) -> None:
+            if scope["path"] == "/v1/slow":
+                await enough.wait()
+            await ok(scope, receive, send)
+
+        admission = Admission(slow, 2)
+        held = [asyncio.create_task(exchange(admission, [part(0)], "/v1/slow")) for _ in range(2)]
+        await asyncio.sleep(0)
+        refused = await exchange(admission, [part(0)])
+        assert refused[0]["status"] == 503
+        assert (b"retry-after", b"1") in refused[0]["headers"]
+        assert (await exchange(admission, [part(0)], "/healthz"))[0]["status"] == 200
+        enough.set()
+        assert [(await each)[0]["status"] for each in held] == [200, 200]
+        assert (await exchange(admission, [part(0)]))[0]["status"] == 200
+
+    asyncio.run(scenario())
+
+
+def test_an_upload_larger_than_it_may_be_is_refused_by_its_header(http: TestClient, tmp_path: Path) -> None:
+    floor = http.get(f"/v1/buildings/{http.get('/v1/buildings').json()['items'][0]['id']}/floors").json()["items"][0][
+        "id"
+    ]
+    answer = http.post(f"/v1/floors/{floor}/surveys", content=b"x", headers={"Content-Length": str(10**9)})
+    assert answer.status_code == 413

@@ -1,0 +1,67 @@
+"""Work in turns: in order of arrival, refused when it would wait too long, not done when nobody waits any more."""
+
+import asyncio
+import time
+from collections.abc import Iterator
+from threading import Event
+
+import pytest
+
+from app.errors import Overloaded
+from app.services.turns import Turns
+
+
+@pytest.fixture
+def turns() -> Iterator[Turns]:
+    made = Turns(1, "turn", 0.5)
+    yield made
+    made.shutdown()
+
+
+def test_what_would_wait_too_long_is_refused_at_once_and_told_when(turns: Turns) -> None:
+    for _ in range(30):
+        turns.submit(time.sleep, 0.02).result()
+    enough = Event()
+    held = [turns.submit(enough.wait, 60) for _ in range(100)]
+    with pytest.raises(Overloaded, match="100 others wait already") as refused:
+        asyncio.run(turns.run(lambda: None))
+    assert refused.value.retry_after_s == pytest.approx(turns.expected_wait_s)
+    assert refused.value.retry_after_s > 0.5
+    enough.set()
+    assert all(each.result() for each in held)
+    assert asyncio.run(turns.run(lambda: "again")) == "again", "it recovers at once"
+
+
+def test_one_slow_work_does_not_close_the_door(turns: Turns) -> None:
+    """The first of all, which loads what the others find loaded."""
+    turns.submit(time.sleep, 0.7).result()
+    enough = Event()
+    turns.submit(enough.wait, 60)
+    turns.check()
+    enough.set()
+
+
+def test_work_is_not_done_for_a_client_that_has_gone(turns: Turns) -> None:
+    done = []
+
+    async def scenario() -> None:
+        enough = Event()
+        turns.submit(enough.wait, 60)
+
+        async def gone() -> bool:
+            return True
+
+        waiting = asyncio.create_task(turns.run(lambda: done.append(1), gone))
+        await asyncio.sleep(0.1)
+        enough.set()
+        with pytest.raises(Overloaded, match="gone"):
+            await waiting
+
+    asyncio.run(scenario())
+    assert done == []
+
+
+def test_a_fault_in_the_work_is_the_callers(turns: Turns) -> None:
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(turns.run(lambda: 1 // 0))
+    assert asyncio.run(turns.run(lambda: 1)) == 1
