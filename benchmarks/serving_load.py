@@ -117,8 +117,7 @@ def server(folder: Path, cores: set[int] | None = None) -> Iterator[tuple[int, i
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     environment = {**os.environ, "ISODYN_DATA_DIR": str(folder), "ISODYN_ADMIN_KEY": KEY, "ISODYN_PORT": str(port),
-                   "ISODYN_GRID_CACHE_BYTES": str(2**30)}  # fmt: skip
-    environment |= RATES_OFF
+                   "ISODYN_GRID_CACHE_BYTES": str(2**30), "ISODYN_LOG_LEVEL": "warning"}  # fmt: skip
     hold = ["taskset", "--cpu-list", ",".join(map(str, sorted(cores)))] if cores else []
     start = time.perf_counter()
     process = subprocess.Popen([*hold, sys.executable, "-m", "app.cli", "serve", "--no-worker"], env=environment)
@@ -128,9 +127,6 @@ def server(folder: Path, cores: set[int] | None = None) -> Iterator[tuple[int, i
     finally:
         process.terminate()
         process.wait()
-
-
-RATES_OFF: dict[str, str] = {}
 
 
 class Clients:

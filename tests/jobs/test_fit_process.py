@@ -5,6 +5,7 @@ import os
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
@@ -21,10 +22,12 @@ def test_a_child_that_did_well_is_kept_for_the_next_fit_and_another_is_not(
     monkeypatch.setenv("ISODYN_TEST_DIARY", str(diary))
     fits, blobs = FitProcesses(), f"file://{tmp_path}"
     plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
+    large = np.ones(2**27)  # 1 GiB of ours is not the child's
     for orders in ({}, {}, {"fail": True}, {}):
         with nullcontext() if not orders else pytest.raises(FitFailed, match="walk the floor again"):
             fits.run("tests.jobs.fake_builder", plan | orders, blobs, quiet)
     fits.close()
+    del large
     pids = [entry["pid"] for entry in map(json.loads, diary.read_text().splitlines()) if entry["event"] == "fit starts"]
     assert pids[0] == pids[1] == pids[2] != pids[3]
     for pid in set(pids):

@@ -13,14 +13,14 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
 from itertools import cycle
 from pathlib import Path
 from random import Random
-from threading import Event, Lock, Thread
-from typing import Any, cast
+from threading import Event, Thread
+from typing import Any, Self, cast
 
 import httpx
 import numpy as np
@@ -86,9 +86,17 @@ class Client:
 
     def __init__(self, addresses: Sequence[str], seen: Seen) -> None:
         headers = {"Authorization": f"Bearer {KEY}"}
-        self._https = cycle([httpx.Client(base_url=each, headers=headers, timeout=60.0) for each in addresses])
+        self._all = [httpx.Client(base_url=each, headers=headers, timeout=60.0) for each in addresses]
+        self._https = cycle(self._all)
         self._http = next(self._https)
-        self._seen, self._lock = seen, Lock()
+        self._seen = seen
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for http in self._all:
+            http.close()
 
     def ask(self, method: str, path: str, **arguments: Any) -> Any:
         """The JSON of the answer, once there is one. Raises AssertionError for one that should never be."""
@@ -135,35 +143,42 @@ def run_campaign(
     Each client waits `pace_s` after each; the order in which a floor gets its surveys is always the same.
     """
     seen, start = Seen(), time.monotonic()
-    client = Client(site.addresses, seen)
-    building = client.ask("POST", "/v1/buildings", json={"name": "House"}, headers={"Idempotency-Key": "house"})["id"]
-    floors = [
-        client.ask("POST", f"/v1/buildings/{building}/floors", headers={"Idempotency-Key": f"floor-{k}"},
-                   json={"name": str(k), "ordinal": k, "elevation_m": 0.0, "auto_build": auto_build})["id"]
-        for k in range(FLOORS)
-    ]  # fmt: skip
-    with _bad_days(site, seen, seed, every_s), _watched(site, seen, floors), ThreadPoolExecutor(CLIENTS) as pool:
-        streams = [pool.submit(_upload, site, seen, floors, k, uploads, pace_s) for k in range(CLIENTS)]
-        for stream in streams:
-            stream.result()
-    _wait_for_jobs(client, seen)
-    _look_for_losses(client, seen, floors)
-    for k, floor in enumerate(floors):
-        job = client.ask("POST", f"/v1/floors/{floor}/maps", json={}, headers={"Idempotency-Key": f"last-{k}"})["job"]
-        seen.maps[k] = str(_ended(client, job["id"])["result"]["sha256"])
+    with Client(site.addresses, seen) as client:
+        floors = _settle(client, auto_build)
+        with _bad_days(site, seen, seed, every_s), _watched(site, seen, floors), ThreadPoolExecutor(CLIENTS) as pool:
+            streams = [pool.submit(_upload, site, seen, floors, k, uploads, pace_s) for k in range(CLIENTS)]
+            for stream in streams:
+                stream.result()
+        _wait_for_jobs(client, seen)
+        _look_for_losses(client, seen, floors)
+        for k, floor in enumerate(floors):
+            headers = {"Idempotency-Key": f"last-{k}"}
+            job = client.ask("POST", f"/v1/floors/{floor}/maps", json={}, headers=headers)["job"]
+            seen.maps[k] = str(_ended(client, job["id"])["result"]["sha256"])
     seen.seconds = time.monotonic() - start
     return seen
 
 
+def _settle(client: Client, auto_build: bool) -> list[str]:
+    """A building: its floors."""
+    building = client.ask("POST", "/v1/buildings", json={"name": "House"}, headers={"Idempotency-Key": "house"})["id"]
+    floors = []
+    for k in range(FLOORS):
+        body = {"name": str(k), "ordinal": k, "elevation_m": 0.0, "auto_build": auto_build}
+        headers = {"Idempotency-Key": f"floor-{k}"}
+        floors.append(client.ask("POST", f"/v1/buildings/{building}/floors", json=body, headers=headers)["id"])
+    return floors
+
+
 def _upload(site: Installation, seen: Seen, floors: Sequence[str], client: int, uploads: int, pace_s: float) -> None:
     """One client's share, to one of its floors after the other."""
-    http = Client(site.addresses, seen)
-    for number in range(client, uploads, CLIENTS):
-        floor = number % FLOORS
-        walk = walk_csv(floor, number)
-        survey = http.ask("POST", f"/v1/floors/{floors[floor]}/surveys", content=walk)["survey"]
-        seen.acknowledged[survey["id"]] = sha256(walk).hexdigest()
-        time.sleep(pace_s)
+    with Client(site.addresses, seen) as http:
+        for number in range(client, uploads, CLIENTS):
+            floor = number % FLOORS
+            walk = walk_csv(floor, number)
+            survey = http.ask("POST", f"/v1/floors/{floors[floor]}/surveys", content=walk)["survey"]
+            seen.acknowledged[survey["id"]] = sha256(walk).hexdigest()
+            time.sleep(pace_s)
 
 
 @contextmanager
@@ -198,27 +213,13 @@ def _watched(site: Installation, seen: Seen, floors: Sequence[str]) -> Iterator[
     over = Event()
 
     def watch() -> None:
-        client = Client(site.addresses, seen)
         surveys = dict.fromkeys(floors, 0)
-        for floor in cycle(floors):
-            if over.wait(0.1):
-                return
-            try:
-                active = client.ask("GET", f"/v1/floors/{floor}")["active_map_id"]
-                if active is None:
-                    continue
-                told = client.ask("GET", f"/v1/maps/{active}")
-                points = {"points_m": [[4.0, 4.0, 1.2], [8.0, 3.0, 1.2]]}
-                field = client.ask("POST", f"/v1/maps/{active}/field", json=points)
-                client.ask("GET", f"/v1/maps/{active}/quality")
-            except AssertionError:  # told already
-                continue
-            seen.looks += 1
-            if told["status"] != "ready" or len(field["measured"]) != 2:
-                seen.wrong.append(f"the active map {active} is {told['status']}, {field['measured']}")
-            if len(told["survey_ids"]) < surveys[floor]:
-                seen.wrong.append(f"floor {floor} went back from {surveys[floor]} to {len(told['survey_ids'])} surveys")
-            surveys[floor] = max(surveys[floor], len(told["survey_ids"]))
+        with Client(site.addresses, seen) as client:
+            for floor in cycle(floors):
+                if over.wait(0.1):
+                    return
+                with suppress(AssertionError):  # told already
+                    _look(client, seen, floor, surveys)
 
     thread = Thread(target=watch, daemon=True)
     thread.start()
@@ -227,6 +228,23 @@ def _watched(site: Installation, seen: Seen, floors: Sequence[str]) -> Iterator[
     finally:
         over.set()
         thread.join()
+
+
+def _look(client: Client, seen: Seen, floor: str, surveys: dict[str, int]) -> None:
+    """At what a reader sees of a floor; `surveys` are those its map had before."""
+    active = client.ask("GET", f"/v1/floors/{floor}")["active_map_id"]
+    if active is None:
+        return
+    told = client.ask("GET", f"/v1/maps/{active}")
+    points = {"points_m": [[4.0, 4.0, 1.2], [8.0, 3.0, 1.2]]}
+    field = client.ask("POST", f"/v1/maps/{active}/field", json=points)
+    client.ask("GET", f"/v1/maps/{active}/quality")
+    seen.looks += 1
+    if told["status"] != "ready" or len(field["measured"]) != 2:
+        seen.wrong.append(f"the active map {active} is {told['status']}, {field['measured']}")
+    if len(told["survey_ids"]) < surveys[floor]:
+        seen.wrong.append(f"floor {floor} went back from {surveys[floor]} to {len(told['survey_ids'])} surveys")
+    surveys[floor] = max(surveys[floor], len(told["survey_ids"]))
 
 
 def _wait_for_jobs(client: Client, seen: Seen) -> None:

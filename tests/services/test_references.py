@@ -12,7 +12,7 @@ from app.jobs.queue import JobQueue
 from app.services.manage_keys import ensure_admin_key
 from app.services.references import CACHES, IN_JSON, NAMING, carried_by_jobs, references
 
-HASHES_OF_NO_BLOB = {"key.sha256", "track_steps.sha256", "idempotency.fingerprint"}
+HASHES_OF_NO_BLOB = {"key.sha256", "track_steps.sha256", "idempotency.fingerprint", "job.request_id"}
 
 JSON_WITHOUT_BLOBS = {
     "key.scopes", "key.building_ids", "audit.details",
