@@ -119,8 +119,9 @@ def _tell(scope: Scope, method: str, route: str, seen: _Seen) -> None:
     level = logging.ERROR if seen.status >= 500 else logging.DEBUG if route in _PROBES else logging.INFO
     identity: Any = scope["state"].get("identity")
     _log.log(
-        level, "%s %s %d", method, route, seen.status,
+        level, "%s %s %d %.1f ms", method, route, seen.status, 1e3 * seen.seconds,
         extra={
+            "in_message": {"method", "route", "status", "duration_ms"},
             "method": method, "route": route, "status": seen.status, "duration_ms": round(1e3 * seen.seconds, 1),
             "bytes_in": seen.bytes_in, "bytes_out": seen.bytes_out,
             "key_id": getattr(identity, "key_id", None), "organisation_id": getattr(identity, "organisation_id", None),

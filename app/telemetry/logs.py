@@ -20,7 +20,7 @@ LogLevel = Literal["debug", "info", "warning", "error"]
 
 _OURS = ("app", "workers")
 _NAMES = {"levelname": "level", "name": "logger"}
-_NOT_SAID = {*RESERVED_ATTRS, "message", "asctime", "taskName", "color_message"}
+_NOT_SAID = {*RESERVED_ATTRS, "message", "asctime", "taskName", "color_message", "in_message"}
 
 
 def configure_logs(format: LogFormat, level: LogLevel) -> None:
@@ -78,7 +78,7 @@ class _Json(JsonFormatter):
 
 
 class _Text(logging.Formatter):
-    """`2026-01-31T12:00:00.123Z INFO app.api.access_log: GET /healthz 200 request_id=... status=200`"""
+    """`2026-01-31T12:00:00.123Z INFO app.api.access_log: GET /v1/buildings 200 3.1 ms request_id=...`"""
 
     converter = time.gmtime  # type: ignore[assignment]
     default_time_format = "%Y-%m-%dT%H:%M:%S"
@@ -88,7 +88,8 @@ class _Text(logging.Formatter):
         super().__init__("%(asctime)s %(levelname)s %(name)s: %(message)s")
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        more: dict[str, Any] = {name: value for name, value in vars(record).items() if name not in _NOT_SAID}
+        said = _NOT_SAID | getattr(record, "in_message", set())
+        more: dict[str, Any] = {name: value for name, value in vars(record).items() if name not in said}
         return " ".join(
             [super().formatMessage(record), *(f"{k}={v}" for k, v in more.items() if v is not None)]
         )  # fmt: skip
