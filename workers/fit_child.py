@@ -22,7 +22,7 @@ from opentelemetry.context import attach
 
 from app.errors import IsodynError, JobCancelled, Unavailable
 from app.settings import Settings
-from app.telemetry.facts import add_facts
+from app.telemetry.facts import with_facts
 from app.telemetry.logs import configure_logs
 from app.telemetry.tracing import configure_tracing, flush_traces, traced_from
 from workers.builder import load_builder
@@ -79,9 +79,9 @@ def main() -> None:
 
     kept = True
     while kept and (order := orders.next()) is not None:
-        add_facts(**order.get("facts", {}))  # what it logs and traces belongs to the job that it works for
         attach(traced_from(order.get("trace")))
-        answer = _answer(order, progress)
+        with with_facts(**order.get("facts", {})):  # what it logs and traces belongs to the job that it works for
+            answer = _answer(order, progress)
         flush_traces()
         kept = "result" in answer and _highest_memory_kib() < LARGEST_KEPT_KIB
         answers.write(json.dumps(answer | {"kept": kept}) + "\n")

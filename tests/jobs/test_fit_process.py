@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.telemetry.facts import with_facts
 from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
 
 
@@ -33,6 +34,21 @@ def test_a_child_that_did_well_is_kept_for_the_next_fit_and_another_is_not(
     for pid in set(pids):
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+def test_a_fit_says_nothing_of_the_fit_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ISODYN_TEST_DIARY", str(tmp_path / "diary"))
+    fits, blobs = FitProcesses(), f"file://{tmp_path}"
+    plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
+    with with_facts(request_id="the-first", job_id="1"):
+        fits.run("tests.jobs.fake_builder", plan, blobs, quiet)
+    with with_facts(job_id="2"), pytest.raises(FitFailed, match="ZeroDivisionError"):
+        fits.run("tests.jobs.fake_builder", plan | {"break": True}, blobs, quiet)
+    log = capfd.readouterr().err
+    assert "job_id=2" in log
+    assert "the-first" not in log
 
 
 def test_a_fit_that_makes_no_progress_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
