@@ -43,7 +43,11 @@ class InstallationMetrics(Collector):
         yield up
 
     def _disk(self) -> Iterator[Metric]:
-        disk = shutil.disk_usage(self._data_dir)
+        try:
+            disk = shutil.disk_usage(self._data_dir)
+        except OSError as error:
+            _log.warning("metrics without the disk's: %s", error)
+            return
         yield _gauge("isodyn_disk_size_bytes", "Size of the disk of the data folder.", disk.total)
         yield _gauge("isodyn_disk_free_bytes", "Free space there.", disk.free)
 
