@@ -106,7 +106,8 @@ def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
     try:
         builder = load_builder(order["builder"])
         with threadpool_limits(1):
-            return {"result": builder.fit_build(order["plan"], open_blob_store(order["blob_url"]), progress)}
+            blobs = open_blob_store(order["blob_url"], make=False)
+            return {"result": builder.fit_build(order["plan"], blobs, progress)}
     except Unavailable as error:
         logging.getLogger(__name__).warning("%s: %s", error, error.__cause__)
         return {"unavailable": str(error)}

@@ -35,11 +35,14 @@ ADVICE = {
 class FolderBlobStore:
     """Blobs in a local folder, fanned out over two levels: `ab/cd/abcd...`."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
+        """`make`: make the folder where there is none. Once there was one its disk is away, and one made in its place
+        would take what is put, and hide it when the disk is back."""
         self._folder = folder
         self._temporary = folder / "tmp"
-        with self._disk_at_hand():
-            self._temporary.mkdir(parents=True, exist_ok=True)
+        if make:
+            with self._disk_at_hand():
+                self._temporary.mkdir(parents=True, exist_ok=True)
 
     @observed
     def put(self, data: bytes) -> str:
