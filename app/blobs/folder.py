@@ -28,7 +28,7 @@ ADVICE = {
     errno.EDQUOT: "make room or raise the quota, then send it again",
     errno.EROFS: "mount it for writing, then send it again",
     errno.ENOENT: "is its disk mounted?",
-    errno.EACCES: "the process may not write there",
+    errno.EACCES: "the process may not read or write there",
 }
 
 
@@ -76,8 +76,9 @@ class FolderBlobStore:
     @observed
     def exists(self, sha256: str) -> bool:
         check_name(sha256)
-        if self._path(sha256).is_file():
-            return True
+        with self._disk_at_hand():
+            if self._path(sha256).is_file():
+                return True
         self._look_for_folder()
         return False
 
