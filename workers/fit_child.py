@@ -82,10 +82,10 @@ def main() -> None:
         attach(traced_from(order.get("trace")))
         with with_facts(**order.get("facts", {})):  # what it logs and traces belongs to the job that it works for
             answer = _answer(order, progress)
-        flush_traces()
         kept = "result" in answer and _highest_memory_kib() < LARGEST_KEPT_KIB
         answers.write(json.dumps(answer | {"kept": kept}) + "\n")
     answers.close()
+    flush_traces()  # after the answer, which no collector that is away may hold up
     os._exit(0)  # the thread that listens would be in the way of an orderly end
 
 
