@@ -226,6 +226,23 @@ def test_what_a_disk_refuses_is_for_now_and_is_said(disk: Path) -> None:
             missed()
 
 
+def test_a_folder_that_may_not_be_read_is_for_now(tmp_path: Path) -> None:
+    store = FolderBlobStore(tmp_path / "blobs")
+    kept = store.put(b"magnetite")
+    (tmp_path / "blobs").chmod(0)
+    me = os.geteuid()
+    try:
+        if me == 0:  # whom nothing is forbidden
+            os.seteuid(65534)
+        for refused in (lambda: store.get(kept), lambda: store.exists(kept), lambda: store.put(b"hematite")):
+            with pytest.raises(Unavailable, match="may not read or write there"):
+                refused()
+    finally:
+        os.seteuid(me)
+        (tmp_path / "blobs").chmod(0o700)
+    assert store.exists(kept)
+
+
 def test_addresses(tmp_path: Path) -> None:
     folder = tmp_path / "my blobs"
     sha256 = open_blob_store(f"file://{folder}".replace(" ", "%20")).put(b"magnetite")

@@ -22,7 +22,7 @@ from opentelemetry.context import attach
 
 from app.errors import IsodynError, JobCancelled, Unavailable
 from app.settings import Settings
-from app.telemetry.facts import add_facts
+from app.telemetry.facts import with_facts
 from app.telemetry.logs import configure_logs
 from app.telemetry.tracing import configure_tracing, flush_traces, traced_from
 from workers.builder import load_builder
@@ -79,13 +79,13 @@ def main() -> None:
 
     kept = True
     while kept and (order := orders.next()) is not None:
-        add_facts(**order.get("facts", {}))  # what it logs and traces belongs to the job that it works for
         attach(traced_from(order.get("trace")))
-        answer = _answer(order, progress)
-        flush_traces()
+        with with_facts(**order.get("facts", {})):  # what it logs and traces belongs to the job that it works for
+            answer = _answer(order, progress)
         kept = "result" in answer and _highest_memory_kib() < LARGEST_KEPT_KIB
         answers.write(json.dumps(answer | {"kept": kept}) + "\n")
     answers.close()
+    flush_traces()  # after the answer, which no collector that is away may hold up
     os._exit(0)  # the thread that listens would be in the way of an orderly end
 
 
@@ -106,7 +106,8 @@ def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
     try:
         builder = load_builder(order["builder"])
         with threadpool_limits(1):
-            return {"result": builder.fit_build(order["plan"], open_blob_store(order["blob_url"]), progress)}
+            blobs = open_blob_store(order["blob_url"], make=False)
+            return {"result": builder.fit_build(order["plan"], blobs, progress)}
     except Unavailable as error:
         logging.getLogger(__name__).warning("%s: %s", error, error.__cause__)
         return {"unavailable": str(error)}

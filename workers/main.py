@@ -19,6 +19,7 @@ from prometheus_client import start_http_server
 from sqlalchemy import Engine
 from sqlalchemy.exc import SQLAlchemyError
 
+from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.engine import QUEUE, engine_configuration, open_client
 from app.jobs.lease import Lease
@@ -57,6 +58,7 @@ def run_worker(
         start_http_server(settings.worker_metrics_port, settings.host)
     url = settings.resolved_database_url
     migrate(url)
+    open_blob_store(settings.resolved_blob_url)  # makes its folder: no fit does
     engine = create_database_engine(url)
     client = open_client(engine)
     context = WorkflowContext(

@@ -6,7 +6,7 @@ from dbos import DBOSClient
 from sqlalchemy import select
 
 from app.db.tables import Job
-from app.jobs.queue import FINAL_STATES
+from app.jobs.admission import IN_HAND
 from workers.workflows import WorkflowContext
 
 __all__ = ["close_abandoned_jobs", "has_unfinished_jobs"]
@@ -30,7 +30,7 @@ def has_unfinished_jobs(client: DBOSClient, worker_id: str) -> bool:
 def close_abandoned_jobs(client: DBOSClient, context: WorkflowContext) -> None:
     """Give a last state to jobs that look open although the engine will never touch them again."""
     with context.sessions() as session:
-        rows = session.execute(select(Job.workflow_id, Job.id).where(Job.status.not_in(FINAL_STATES)))
+        rows = session.execute(select(Job.workflow_id, Job.id).where(IN_HAND))
         open_jobs = {row.workflow_id: row.id for row in rows}
     if not open_jobs:
         return

@@ -28,18 +28,21 @@ ADVICE = {
     errno.EDQUOT: "make room or raise the quota, then send it again",
     errno.EROFS: "mount it for writing, then send it again",
     errno.ENOENT: "is its disk mounted?",
-    errno.EACCES: "the process may not write there",
+    errno.EACCES: "the process may not read or write there",
 }
 
 
 class FolderBlobStore:
     """Blobs in a local folder, fanned out over two levels: `ab/cd/abcd...`."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
+        """`make`: make the folder where there is none. Once there was one its disk is away, and one made in its place
+        would take what is put, and hide it when the disk is back."""
         self._folder = folder
         self._temporary = folder / "tmp"
-        with self._disk_at_hand():
-            self._temporary.mkdir(parents=True, exist_ok=True)
+        if make:
+            with self._disk_at_hand():
+                self._temporary.mkdir(parents=True, exist_ok=True)
 
     @observed
     def put(self, data: bytes) -> str:
@@ -73,8 +76,9 @@ class FolderBlobStore:
     @observed
     def exists(self, sha256: str) -> bool:
         check_name(sha256)
-        if self._path(sha256).is_file():
-            return True
+        with self._disk_at_hand():
+            if self._path(sha256).is_file():
+                return True
         self._look_for_folder()
         return False
 

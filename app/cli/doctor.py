@@ -20,7 +20,6 @@ from app.settings import Settings
 __all__ = ["doctor", "examine"]
 
 LOW_DISK_BYTES = 2**30
-FRESH_BEAT_S = 120
 
 
 def doctor(
@@ -84,6 +83,7 @@ def _database(settings: Settings) -> Iterator[Finding]:
 
     from app.db.engine import create_database_engine, migration_state, session_factory
     from app.db.tables import Job, Key, Worker, utc_now
+    from app.jobs.lease import FRESH_BEAT_S
 
     url = settings.resolved_database_url
     if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).exists():

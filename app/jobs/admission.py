@@ -14,10 +14,13 @@ from sqlalchemy.orm import Session, aliased
 from app.db.engine import lock_for_transaction
 from app.db.tables import Job, Worker
 
-__all__ = ["HIGH", "LOW", "NORMAL", "admit_next"]
+__all__ = ["HIGH", "IN_HAND", "LOW", "NORMAL", "admit_next"]
 
 HIGH, NORMAL, LOW = 1, 2, 3
 """Priorities, the first served first. What somebody asked for is normal, what follows from an upload is low."""
+
+IN_HAND = or_(Job.status == "running", (Job.status == "accepted") & Job.admitted_at.is_not(None))
+"""Jobs that the engine has: as many as there are slots, however many wait."""
 
 LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
 ADMISSION_LOCK = 0x150D_12  # any constant of our own: PostgreSQL's advisory locks are numbers
@@ -39,11 +42,7 @@ def admit_next(session: Session) -> list[Job]:
     """
     lock_for_transaction(session, ADMISSION_LOCK)
     session.flush()
-    in_hand = session.execute(
-        select(Job.organisation_id, Job.floor_id).where(
-            or_(Job.status == "running", (Job.status == "accepted") & Job.admitted_at.is_not(None))
-        )
-    ).all()
+    in_hand = session.execute(select(Job.organisation_id, Job.floor_id).where(IN_HAND)).all()
     room = _slots(session) - len(in_hand)
     if room <= 0:
         return []

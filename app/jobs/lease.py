@@ -14,7 +14,10 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from app.db.tables import Worker
 
-__all__ = ["Lease"]
+__all__ = ["FRESH_BEAT_S", "Lease"]
+
+FRESH_BEAT_S = 120.0
+"""A worker whose beat is older does not live, for whoever looks by a clock of its own: four times the usual lease."""
 
 LONG_AGO = datetime(2000, 1, 1, tzinfo=UTC)
 

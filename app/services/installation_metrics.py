@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from sqlalchemy.pool import QueuePool
 
 from app.db.tables import BUILD, REBUILD, Job, Track, Worker, utc_now
+from app.jobs.lease import FRESH_BEAT_S
 
 __all__ = ["InstallationMetrics"]
 
@@ -43,7 +44,11 @@ class InstallationMetrics(Collector):
         yield up
 
     def _disk(self) -> Iterator[Metric]:
-        disk = shutil.disk_usage(self._data_dir)
+        try:
+            disk = shutil.disk_usage(self._data_dir)
+        except OSError as error:
+            _log.warning("metrics without the disk's: %s", error)
+            return
         yield _gauge("isodyn_disk_size_bytes", "Size of the disk of the data folder.", disk.total)
         yield _gauge("isodyn_disk_free_bytes", "Free space there.", disk.free)
 
@@ -75,8 +80,11 @@ def _jobs(session: Session) -> Iterator[Metric]:
 
 def _workers(session: Session) -> Iterator[Metric]:
     beats = session.scalars(select(Worker.beat).where(Worker.state == "live")).all()
-    yield _gauge("isodyn_workers_live", "Workers that hold a lease.", len(beats))
-    yield _gauge("isodyn_workers_oldest_beat_seconds", "Age of the oldest beat of these; 0 without one.", _age_s(beats))
+    fresh = [beat for beat in beats if _age_s([beat]) < FRESH_BEAT_S]  # the last to die is declared dead by nobody
+    yield _gauge("isodyn_workers_live", "Workers that hold a lease.", len(fresh))
+    yield _gauge(
+        "isodyn_workers_oldest_beat_seconds", "Age of the oldest beat of all that did not sign off.", _age_s(beats)
+    )
 
 
 def _tracks(session: Session) -> Iterator[Metric]:

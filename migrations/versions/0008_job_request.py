@@ -1,6 +1,6 @@
 """Which request asked for a job, and where in a trace that was.
 
-Revision: 0008, after 0005.
+Revision: 0008, after 0007.
 """
 
 import sqlalchemy as sa

@@ -11,7 +11,9 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
+from sqlalchemy.pool import QueuePool
 
+from app.db.engine import create_database_engine
 from app.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -84,6 +86,16 @@ def test_every_image_is_pinned_and_names_no_host() -> None:
     for image in set(images) - {"isodyn"}:
         assert re.search(r"\d+\.\d+", image), image
         assert "." not in image.split("/")[0] or "/" not in image, image
+
+
+def test_the_database_takes_all_that_the_guide_scales_to() -> None:
+    """As `--scale api=3 --scale worker=2` does, and as many again while they are replaced."""
+    allowed = int(COMPOSE["services"]["db"]["command"][-1].removeprefix("max_connections="))
+    engine = create_database_engine("postgresql+psycopg://nobody@127.0.0.1:1/none")
+    assert isinstance(engine.pool, QueuePool)
+    of_web_process = engine.pool.size() + engine.pool._max_overflow
+    of_worker = of_web_process + 20  # of the job engine
+    assert 2 * (3 * of_web_process + 2 * of_worker) < allowed
 
 
 def test_the_secrets_made_are_those_asked_for(tmp_path: Path) -> None:

@@ -7,13 +7,16 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import pytest
-from sqlalchemy import Engine, delete, select, update
+from sqlalchemy import Engine, delete, select, text, update
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Floor, Job, Map, Worker
 from app.jobs import JobQueue
 from app.jobs.admission import HIGH, LOW, NORMAL
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
+from workers.builder import DEFAULT_BUILDER, load_builder
+from workers.reconcile import close_abandoned_jobs
+from workers.workflows import WorkflowContext
 
 if TYPE_CHECKING:
     from conftest import Site
@@ -152,6 +155,32 @@ def test_a_waiting_job_that_is_cancelled_makes_room(site: "Site", hire: Hire) ->
     first, second = upload(site, site.floors(2))
     assert site.cancel(first).status == "dismissed"
     assert [job.id for job in in_hand(site)] == [second]
+
+
+def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(
+    site: "Site", hire: Hire, engine: Engine, sessions: sessionmaker[Session]
+) -> None:
+    """More than a statement may have parameters."""
+    hire(1)
+    given_up, waiting = upload(site, site.floors(2))
+    with engine.begin() as connection:
+        columns = "organisation_id, floor_id, kind, priority, status, progress, message, cancel_requested, created_at"
+        connection.execute(
+            text(
+                "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 70000) "
+                f"INSERT INTO job (id, workflow_id, {columns}) SELECT 'copy ' || k, 'copy ' || k, {columns} "
+                "FROM n, job WHERE id = :waiting"
+            ),
+            {"waiting": waiting},
+        )
+    client = open_client(engine)
+    client.cancel_workflow(site.job(given_up).workflow_id)
+    builder = load_builder(DEFAULT_BUILDER)
+    close_abandoned_jobs(client, WorkflowContext(sessions, site.queue, "", builder, DEFAULT_BUILDER))
+    client.destroy()
+    assert site.job(given_up).status == "failed"
+    admit(site)
+    assert [job.id for job in in_hand(site)] == [waiting]
 
 
 def test_beside_a_worker_of_an_older_version_all_are_admitted(site: "Site", hire: Hire) -> None:

@@ -1,9 +1,11 @@
 """Keys: recognised by hash, remembered for a moment, useless once revoked or expired."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Audit, Key, utc_now
@@ -55,6 +57,23 @@ def test_each_process_forgets_by_itself_within_its_two_seconds(
     assert all(ring.recent(secret) for ring in rings), "this is the bound that docs/keys.md states"
     now += 0.01
     assert not any(ring.recent(secret) or ring.recognise(secret) for ring in rings)
+
+
+def test_two_processes_write_down_the_same_keys_at_once(sessions: sessionmaker[Session]) -> None:
+    with sessions.begin() as session:
+        secrets = [create_key(session, organisation="mine", name=f"busy {n}", scopes=["locate"]) for n in (1, 2)]
+        first, second = session.scalars(select(Key.id).where(Key.name.startswith("busy")).order_by(Key.id)).all()
+    ring = KeyRing(sessions)
+    assert all(ring.recognise(secret) for secret in reversed(secrets))
+    with ThreadPoolExecutor(1) as pool:
+        with sessions.begin() as other:
+            other.execute(update(Key).where(Key.id == first).values(last_used_at=None))
+            noting = pool.submit(ring.note_uses)
+            time.sleep(0.5)  # it has its first lock, or waits for it
+            other.execute(update(Key).where(Key.id == second).values(last_used_at=None))
+        noting.result()
+    with sessions() as session:
+        assert all(session.get_one(Key, key_id).last_used_at for key_id in (first, second))
 
 
 def test_an_expired_key_is_not_remembered_past_its_end(

@@ -14,7 +14,9 @@ import httpx
 import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 
+from app.blobs import open_blob_store
 from tests.s3_server import free_port
+from workers.fit_process import FitProcesses
 
 KEY = "isd_of-the-traced"
 TRACE, PARENT = "ab" * 16, "cd" * 8
@@ -25,10 +27,13 @@ class Collector:
 
     def __init__(self) -> None:
         self.spans: list[tuple[str, Any]] = []
+        self.may_answer, self.waited_in_vain = threading.Event(), False
+        self.may_answer.set()
         collector = self
 
         class Receive(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
+                collector.waited_in_vain |= not collector.may_answer.wait(8.0)  # less than a sender waits
                 body = self.rfile.read(int(self.headers["content-length"]))
                 assert self.path == "/v1/traces"
                 for resource in ExportTraceServiceRequest.FromString(body).resource_spans:
@@ -138,6 +143,23 @@ def test_a_request_its_statements_and_its_job_are_one_story(
     assert [line for line in log if "the job ended" in line and '"request_id": "asked"' in line and job["id"] in line]
     told = str([span for _, span in collector.spans])
     assert not [word for word in (building, "House", KEY) if word in told]
+
+
+def test_a_collector_that_is_slow_does_not_hold_up_a_fit(
+    collector: Collector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", collector.url)
+    monkeypatch.setenv("ISODYN_TEST_DIARY", str(tmp_path / "diary"))
+    blobs = f"file://{tmp_path / 'blobs'}"
+    open_blob_store(blobs)
+    collector.may_answer.clear()
+    fits = FitProcesses()
+    plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
+    assert fits.run("tests.jobs.fake_builder", plan, blobs, lambda _fraction, _message: None)
+    collector.may_answer.set()
+    collector.wait_for("isodyn-fit", "blob put")
+    fits.close()
+    assert not collector.waited_in_vain
 
 
 def test_traces_without_what_sends_them_are_a_clear_error(tmp_path: Path) -> None:
