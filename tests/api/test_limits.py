@@ -1,17 +1,19 @@
 """Limits of keys, organisations and the process: what is refused, how it says so, and that it ends."""
 
 import asyncio
+import gzip
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from starlette.requests import Request
 from starlette.testclient import TestClient
 
 import app.api.body as body_module
 from app.api.admission import Admission, BodyMemory
-from app.api.body import BodyLimit
+from app.api.body import BodyLimit, upload
 from app.api.context import Context
 from app.api.key_limits import KeyLimits
 from app.db.tables import Floor, Survey
@@ -237,6 +239,31 @@ def test_bodies_share_so_much_memory_and_give_it_back() -> None:
         return statuses
 
     assert asyncio.run(scenario()) == [200, 503, 200, 200]
+
+
+def test_a_packed_file_that_does_not_say_so_takes_the_memory_of_what_it_unpacks_to() -> None:
+    async def scenario() -> None:
+        packed = gzip.compress(bytes(50_000))
+        memory, coming = BodyMemory(100_000, 0.05), [{"type": "http.request", "body": packed}] * 2
+        told = [(b"content-length", str(len(packed)).encode())]
+
+        async def receive() -> dict[str, Any]:
+            return coming.pop()
+
+        def request() -> Request:
+            return Request({"type": "http", "method": "POST", "path": "/", "headers": told}, receive)
+
+        async with memory.room(60_000):
+            with pytest.raises(Overloaded):
+                async with upload(request(), 50_000, memory):
+                    pass
+        async with upload(request(), 50_000, memory) as data:
+            assert data == bytes(50_000)
+            with pytest.raises(Overloaded):
+                memory.take(50_001)
+        memory.take(100_000)
+
+    asyncio.run(scenario())
 
 
 def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
