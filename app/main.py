@@ -122,7 +122,7 @@ def open_context(settings: Settings) -> Context:
             surveys_per_floor=settings.max_surveys_per_floor,
             survey_bytes=settings.max_survey_bytes,
         ),
-        bodies=BodyMemory(settings.body_memory_bytes, settings.max_wait_s),
+        bodies=BodyMemory(settings.body_memory_bytes - settings.body_memory_bytes // 4, settings.max_wait_s),
         searches=Turns(threads, "search", settings.max_wait_s),
         follows=follows,
         uploads=Turns(settings.parse_processes, "upload", settings.max_upload_wait_s),
@@ -201,9 +201,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.mount("/view", viewer)
     add_problem_handlers(app)
     # The last one added sees a request first.
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=context.bodies, streams_itself=_is_upload)
     app.add_middleware(KeyLimitsMiddleware, limits=context.key_limits)
     app.add_middleware(Admission, most=settings.max_requests)
+    # Before a request counts as open: nobody knows yet whose it is, and a body may come slowly. Its memory is not that
+    # of uploads, which say whose they are before they are read.
+    bodies = BodyMemory(settings.body_memory_bytes // 4, settings.max_wait_s)
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=bodies, streams_itself=_is_upload)
     app.add_middleware(EntityTags)
     app.add_middleware(SecurityHeaders, hsts_s=settings.hsts_s)
     if settings.cors_origins:

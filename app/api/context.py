@@ -33,7 +33,7 @@ class Context:
     """The open handles of a web process.
 
     `searches` runs the searches for positions: few at once, the others wait in order of arrival. `follows` is
-    the same for tracks, `uploads` for files that are received. `bodies` is the memory for what is sent.
+    the same for tracks, `uploads` for files that are received. `bodies` is the memory for files that are sent.
     """
 
     settings: Settings

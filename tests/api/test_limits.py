@@ -295,6 +295,42 @@ def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
     asyncio.run(scenario())
 
 
+def test_bodies_that_do_not_come_keep_nobody_out(tmp_path: Path) -> None:
+    """From somebody without a key: a request is open once its body is there."""
+    settings = Settings(data_dir=tmp_path, database_url=None, blob_url=None, admin_key=ADMIN, max_requests=2)
+    first_start(settings)
+    application = create_app(settings)
+    most = settings.body_memory_bytes // settings.max_body_bytes
+
+    async def ask(method: str, path: str, key: str = "", body: Messages | None = None) -> int:
+        coming, statuses = list(body or [part(0)]), []
+
+        async def receive() -> dict[str, Any]:
+            return coming.pop(0) if coming else await asyncio.sleep(60, {})
+
+        async def send(message: Any) -> None:
+            statuses.append(message.get("status"))
+
+        headers = [(b"authorization", f"Bearer {key}".encode())] if key else []
+        scope = {"type": "http", "http_version": "1.1", "scheme": "http", "method": method, "path": path,
+                 "query_string": b"", "headers": headers, "client": ("127.0.0.1", 1)}  # fmt: skip
+        await application(scope, receive, send)
+        return int(statuses[0])
+
+    async def scenario() -> None:
+        unfinished = part(settings.max_body_bytes, more=True)
+        held = [asyncio.create_task(ask("POST", "/v1/buildings", body=[unfinished])) for _ in range(most)]
+        await asyncio.sleep(0)
+        assert await ask("GET", "/v1/buildings", ADMIN) == 200
+        async with application.state.context.bodies.room(settings.max_upload_bytes):
+            pass
+        for each in held:
+            each.cancel()
+        await asyncio.gather(*held, return_exceptions=True)
+
+    asyncio.run(scenario())
+
+
 def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None:
     async def scenario() -> None:
         enough = asyncio.Event()
