@@ -46,7 +46,7 @@ from app.api.entity_tags import EntityTags
 from app.api.headers import SecurityHeaders
 from app.api.key_limits import KeyLimits, KeyLimitsMiddleware
 from app.api.problems import Problem, add_problem_handlers
-from app.api.upkeep import BACKGROUND
+from app.api.upkeep import BACKGROUND, note_uses_last
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
@@ -158,7 +158,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         yield
         for task in tasks:
             task.cancel()
-        await run_in_threadpool(context.keys.note_uses)
+        await run_in_threadpool(note_uses_last, context)
         await viewer.close()
         await run_in_threadpool(context.follower.close)
         await run_in_threadpool(context.files.close)

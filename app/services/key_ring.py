@@ -105,12 +105,13 @@ class KeyRing:
         return identity
 
     def note_uses(self) -> None:
-        """Write down when keys were last used. Called now and then, so that no request waits for it."""
+        """Write down when keys were last used. Called now and then, so that no request waits for it. In order of id:
+        several processes that do so at once wait for each other, and never in a circle."""
         used, self._used = self._used, {}
         if used:
             with self._sessions.begin() as session:
                 session.connection().execute(
-                    _LAST_USED, [{"of": key_id, "now": at} for key_id, at in list(used.items())]
+                    _LAST_USED, [{"of": key_id, "now": at} for key_id, at in sorted(used.items())]
                 )
 
 

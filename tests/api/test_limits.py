@@ -354,6 +354,19 @@ def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None
     asyncio.run(scenario())
 
 
+def test_a_database_that_is_away_keeps_no_server_from_stopping(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, database_url=None, blob_url=None, admin_key=ADMIN)
+    first_start(settings)
+    application = create_app(settings)
+    made: Context = application.state.context
+    with TestClient(application, headers={"Authorization": f"Bearer {ADMIN}"}) as http:
+        assert http.get("/v1/buildings").status_code == 200
+        made.files.start()
+        with made.engine.begin() as connection:
+            connection.exec_driver_sql('ALTER TABLE "key" RENAME TO away')
+    assert made.files._program is None, "what comes after was done, too"
+
+
 def test_an_upload_larger_than_it_may_be_is_refused_by_its_header(http: TestClient, tmp_path: Path) -> None:
     floor = http.get(f"/v1/buildings/{http.get('/v1/buildings').json()['items'][0]['id']}/floors").json()["items"][0][
         "id"
