@@ -79,6 +79,7 @@ is. Errors are RFC 9457 problem documents. Every answer names its request in
 
 
 MOST_SEARCHES = 4  # at once: a search holds Python's one lock part of its time, so that more only wait for each other
+LOOK_UPS = 8  # of keys at once: a known key is remembered, so that there are few
 
 
 def first_start(settings: Settings) -> str | None:
@@ -113,6 +114,7 @@ def open_context(settings: Settings) -> Context:
         files=FileReaders(settings.parse_processes, settings.parse_memory_bytes, settings.parse_seconds),
         grids=grids,
         keys=KeyRing(sessions, tokens),
+        look_ups=Turns(LOOK_UPS, "key", settings.max_wait_s),
         tokens=tokens,
         key_limits=KeyLimits(settings.max_requests_per_s, settings.max_requests_per_key, settings.max_streams_per_key),
         quotas=Quotas(

@@ -5,14 +5,17 @@ import gzip
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
 import app.api.body as body_module
 from app.api.admission import Admission, BodyMemory
+from app.api.auth import recognised
 from app.api.body import BodyLimit, upload
 from app.api.context import Context
 from app.api.key_limits import KeyLimits
@@ -350,6 +353,23 @@ def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None
         enough.set()
         assert [(await each)[0]["status"] for each in held] == [200, 200]
         assert (await exchange(admission, [part(0)]))[0]["status"] == 200
+
+    asyncio.run(scenario())
+
+
+def test_a_key_is_known_however_many_slow_requests_there_are(context: tuple[Context, TestClient]) -> None:
+    made, _ = context
+
+    async def scenario() -> None:
+        enough = Event()
+        slow = [asyncio.create_task(run_in_threadpool(enough.wait, 60)) for _ in range(100)]
+        await asyncio.sleep(0.1)
+        made.keys._recent.clear()
+        try:
+            assert (await asyncio.wait_for(recognised(made, ADMIN), 20)).may("admin")
+        finally:
+            enough.set()
+            await asyncio.gather(*slow)
 
     asyncio.run(scenario())
 
