@@ -374,6 +374,23 @@ def test_a_key_is_known_however_many_slow_requests_there_are(context: tuple[Cont
     asyncio.run(scenario())
 
 
+def test_an_upload_that_would_wait_too_long_is_refused_before_it_is_read(
+    context: tuple[Context, TestClient], http: TestClient
+) -> None:
+    building = http.get("/v1/buildings").json()["items"][0]["id"]
+    floor = http.get(f"/v1/buildings/{building}/floors").json()["items"][0]["id"]
+    damaged = {"content": b"no gzip", "headers": {"Content-Encoding": "gzip"}}
+    assert http.post(f"/v1/floors/{floor}/surveys", **damaged).status_code == 422
+    enough = Event()
+    held = [context[0].uploads.submit(enough.wait, 60) for _ in range(2100)]
+    try:
+        assert http.post(f"/v1/floors/{floor}/surveys", **damaged).status_code == 503
+        assert http.put(f"/v1/floors/{floor}/plan?metres_per_pixel=1", **damaged).status_code == 503
+    finally:
+        enough.set()
+    assert all(each.result() for each in held)
+
+
 def test_a_database_that_is_away_keeps_no_server_from_stopping(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, database_url=None, blob_url=None, admin_key=ADMIN)
     first_start(settings)
