@@ -46,7 +46,7 @@ from app.api.entity_tags import EntityTags
 from app.api.headers import SecurityHeaders
 from app.api.key_limits import KeyLimits, KeyLimitsMiddleware
 from app.api.problems import Problem, add_problem_handlers
-from app.api.upkeep import BACKGROUND
+from app.api.upkeep import BACKGROUND, note_uses_last
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
 from app.jobs.queue import JobQueue
@@ -79,6 +79,7 @@ is. Errors are RFC 9457 problem documents. Every answer names its request in
 
 
 MOST_SEARCHES = 4  # at once: a search holds Python's one lock part of its time, so that more only wait for each other
+LOOK_UPS = 8  # of keys at once: a known key is remembered, so that there are few
 
 
 def first_start(settings: Settings) -> str | None:
@@ -113,6 +114,7 @@ def open_context(settings: Settings) -> Context:
         files=FileReaders(settings.parse_processes, settings.parse_memory_bytes, settings.parse_seconds),
         grids=grids,
         keys=KeyRing(sessions, tokens),
+        look_ups=Turns(LOOK_UPS, "key", settings.max_wait_s),
         tokens=tokens,
         key_limits=KeyLimits(settings.max_requests_per_s, settings.max_requests_per_key, settings.max_streams_per_key),
         quotas=Quotas(
@@ -122,7 +124,7 @@ def open_context(settings: Settings) -> Context:
             surveys_per_floor=settings.max_surveys_per_floor,
             survey_bytes=settings.max_survey_bytes,
         ),
-        bodies=BodyMemory(settings.body_memory_bytes, settings.max_wait_s),
+        bodies=BodyMemory(settings.body_memory_bytes - settings.body_memory_bytes // 4, settings.max_wait_s),
         searches=Turns(threads, "search", settings.max_wait_s),
         follows=follows,
         uploads=Turns(settings.parse_processes, "upload", settings.max_upload_wait_s),
@@ -158,7 +160,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         yield
         for task in tasks:
             task.cancel()
-        await run_in_threadpool(context.keys.note_uses)
+        await run_in_threadpool(note_uses_last, context)
         await viewer.close()
         await run_in_threadpool(context.follower.close)
         await run_in_threadpool(context.files.close)
@@ -201,9 +203,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.mount("/view", viewer)
     add_problem_handlers(app)
     # The last one added sees a request first.
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=context.bodies, streams_itself=_is_upload)
     app.add_middleware(KeyLimitsMiddleware, limits=context.key_limits)
     app.add_middleware(Admission, most=settings.max_requests)
+    # Before a request counts as open: nobody knows yet whose it is, and a body may come slowly. Its memory is not that
+    # of uploads, which say whose they are before they are read.
+    bodies = BodyMemory(settings.body_memory_bytes // 4, settings.max_wait_s)
+    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes, memory=bodies, streams_itself=_is_upload)
     app.add_middleware(EntityTags)
     app.add_middleware(SecurityHeaders, hsts_s=settings.hsts_s)
     if settings.cors_origins:

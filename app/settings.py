@@ -35,7 +35,9 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(default=64 * 2**20, description="largest survey body, before and after decompression")
     max_body_bytes: int = Field(default=4 * 2**20, description="largest JSON body")
     body_memory_bytes: int = Field(
-        default=512 * 2**20, ge=2**20, description="memory for all bodies that are being received at one time"
+        default=512 * 2**20,
+        ge=2**20,
+        description="memory for all bodies received at one time, a quarter of it for JSON",
     )
     max_requests: int = Field(default=500, ge=1, description="most requests open at one time, of all keys together")
     max_requests_per_key: int = Field(default=200, ge=1, description="most requests of one key open at one time")

@@ -8,7 +8,6 @@ import logging
 from typing import Annotated
 
 from fastapi import Depends, Request
-from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.requests import HTTPConnection
@@ -52,11 +51,12 @@ RECHECK_S = 5.0
 
 async def recognised(context: Context, secret: str | None, *any_of: str) -> Identity:
     """Whose key this is. Raises Unauthorised, Forbidden where it has none of the scopes that are asked for, and
-    Unavailable where only the issuer of a token could tell."""
+    Unavailable where only the issuer of a token could tell, or where the database does not soon."""
     if secret is None:
         AUTH_FAILURES.labels("missing").inc()
         raise Unauthorised("send your key as `Authorization: Bearer isd_...`")
-    identity = context.keys.recent(secret) or await run_in_threadpool(context.keys.recognise, secret)
+    keys = context.keys
+    identity = keys.recent(secret) or await context.look_ups.run(lambda: keys.recent(secret) or keys.recognise(secret))
     if identity is None:
         AUTH_FAILURES.labels("unknown").inc()
         raise Unauthorised("this key is not known, was revoked or has expired; `isodyn keys create` makes a new one")

@@ -7,7 +7,7 @@ nothing for long. Bodies of all requests together have so much memory (`app.api.
 import asyncio
 import zlib
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import zstandard
 from fastapi import Request
@@ -99,17 +99,20 @@ async def upload(request: Request, max_bytes: int, memory: BodyMemory) -> AsyncI
     said = request.headers.get("content-length", "")
     if said.isdigit() and int(said) > max_bytes:
         raise _too_large(max_bytes)
-    async with memory.room(int(said) if said.isdigit() and encoding not in _UNPACK else max_bytes):
+    async with AsyncExitStack() as held:
+        plain = encoding not in _UNPACK
+        await held.enter_async_context(memory.room(int(said) if said.isdigit() and plain else max_bytes))
         data = await _collect(request.stream(), max_bytes)
-        yield await run_in_threadpool(_UNPACK.get(encoding, _unpack_by_magic), data, max_bytes)
+        if plain and (encoding := _packed_as(data)) in _UNPACK:  # what it unpacks to may be far more than was said
+            await held.aclose()
+            await held.enter_async_context(memory.room(max_bytes))
+        yield data if encoding not in _UNPACK else await run_in_threadpool(_UNPACK[encoding], data, max_bytes)
 
 
-def _unpack_by_magic(data: bytes, max_bytes: int) -> bytes:
+def _packed_as(data: bytes) -> str:
     """A packed file sent as it is, without saying so, is unpacked all the same."""
-    for magic, encoding in ((b"\x1f\x8b", "gzip"), (b"\x28\xb5\x2f\xfd", "zstd")):
-        if data.startswith(magic):
-            return _UNPACK[encoding](data, max_bytes)
-    return data
+    magics = {"gzip": b"\x1f\x8b", "zstd": b"\x28\xb5\x2f\xfd"}
+    return next((encoding for encoding, magic in magics.items() if data.startswith(magic)), "identity")
 
 
 def _gunzip(packed: bytes, max_bytes: int) -> bytes:

@@ -33,7 +33,8 @@ class Context:
     """The open handles of a web process.
 
     `searches` runs the searches for positions: few at once, the others wait in order of arrival. `follows` is
-    the same for tracks, `uploads` for files that are received. `bodies` is the memory for what is sent.
+    the same for tracks, `uploads` for files that are received, `look_ups` for keys, which wait for no slow request.
+    `bodies` is the memory for files that are sent.
     """
 
     settings: Settings
@@ -44,6 +45,7 @@ class Context:
     files: FileReaders
     grids: GridCache
     keys: KeyRing
+    look_ups: Turns
     tokens: "BearerTokens | None"
     key_limits: KeyLimits
     quotas: Quotas

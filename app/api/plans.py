@@ -63,6 +63,7 @@ async def put_plan(
         plan = place_plan(context.blobs, data, placement, context.files.picture)
         return _point_to(context, request, identity, floor_id, plan)
 
+    context.uploads.check()
     async with upload(request, MAX_PLAN_BYTES, context.bodies) as data:
         return await context.uploads.run(lambda: receive(data), request.is_disconnected)
 

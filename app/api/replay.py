@@ -89,6 +89,7 @@ async def replay(
         floors = context.grids.searchable([(each.floor_id, each.grid_sha256) for each in maps])
         return replay_walk(walk, floors, window_m, every_m)
 
+    context.uploads.check()
     async with upload(request, context.settings.max_upload_bytes, context.bodies) as data:
         begun = await context.uploads.run(lambda: begin(data), request.is_disconnected)
     context.searches.check()

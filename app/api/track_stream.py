@@ -20,6 +20,7 @@ import msgspec
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from app.api.auth import Identity, recognised, secret_of, until_refused
 from app.api.context import Context
@@ -64,6 +65,10 @@ async def stream(browser: WebSocket, track_id: str) -> None:
             kind, ready = await context.follows.run(partial(_ready, context, identity, track_id))
         except IsodynError as error:
             await browser.send_denial_response(isodyn_problem(error))
+            return
+        except (OperationalError, PoolTimeout):
+            away = Unavailable("the database cannot be reached now; connect again in a moment")
+            await browser.send_denial_response(isodyn_problem(away))
             return
         offered = browser.scope.get("subprotocols", ())
         await browser.accept(subprotocol=PROTOCOL if PROTOCOL in offered else None)
@@ -190,7 +195,7 @@ class _Stream:
         except IsodynError as error:
             await self._refuse(error)
             return False
-        except OperationalError:
+        except (OperationalError, PoolTimeout):
             detail = "the database cannot be reached now; nothing was stored, connect again and send it again"
             await self._problem(problem_response(503, "unavailable", "Unavailable", detail))
             await self._browser.close(CLOSE_UNAVAILABLE)

@@ -11,7 +11,7 @@ from app.errors import IsodynError
 from app.services.audit_log import prune
 from app.services.keep_warm import keep_warm
 
-__all__ = ["BACKGROUND"]
+__all__ = ["BACKGROUND", "note_uses_last"]
 
 _log = logging.getLogger(__name__)
 EVERY_S = 60.0
@@ -26,6 +26,14 @@ async def keep_up(context: Context) -> None:
         except SQLAlchemyError as error:
             _log.warning("upkeep is tried again in a minute: %s", error)
         await asyncio.sleep(EVERY_S)
+
+
+def note_uses_last(context: Context) -> None:
+    """When the server stops, which no database can keep it from."""
+    try:
+        context.keys.note_uses()
+    except SQLAlchemyError as error:
+        _log.warning("when keys were last used is not known to the minute: %s", error)
 
 
 def _once(context: Context) -> None:

@@ -50,6 +50,12 @@ LOCKED_OUT = (
 DEAD_CLIENT = {  # the last is for an answer on its way, where nothing is probed
     "tcp_keepalives_idle": "10s", "tcp_keepalives_interval": "5s", "tcp_keepalives_count": 3, "tcp_user_timeout": "25s",
 }  # fmt: skip
+DEAD_SERVER = {
+    "connect_timeout": 5, "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3,
+    "tcp_user_timeout": 15_000,
+}  # fmt: skip
+"""A server that was cut off is given up within seconds, unless its address says otherwise. The last is in ms."""
+POOL_TIMEOUT_S = 5.0
 HELD_UP = ("55P03", "57014", "40P01")  # PostgreSQL: lock not available, statement timeout, deadlock
 MIGRATION_LOCK = 0x150D_11  # any constant of our own: PostgreSQL's advisory locks are numbers
 
@@ -65,8 +71,10 @@ def create_database_engine(url: str) -> Engine:
     parsed = _checked(url)
     if parsed.get_backend_name() == "postgresql":
         engine = create_engine(
-            parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800, hide_parameters=True
-        )
+            parsed, pool_pre_ping=True, pool_size=5, max_overflow=15, pool_recycle=1800, pool_timeout=POOL_TIMEOUT_S,
+            hide_parameters=True,
+            connect_args={name: value for name, value in DEAD_SERVER.items() if name not in parsed.query},
+        )  # fmt: skip
         trace_statements(engine)
         event.listen(engine, "connect", let_go_of_the_dead)
         return engine
@@ -74,6 +82,7 @@ def create_database_engine(url: str) -> Engine:
         parsed,
         pool_size=10,
         max_overflow=30,
+        pool_timeout=POOL_TIMEOUT_S,
         hide_parameters=True,
         connect_args={"timeout": BUSY_TIMEOUT_S, "isolation_level": "IMMEDIATE", "check_same_thread": False},
     )

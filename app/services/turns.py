@@ -4,6 +4,7 @@ Whoever would wait longer than `longest_wait_s` is told so at once: a queue that
 """
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
 from threading import Lock
@@ -16,18 +17,20 @@ from app.telemetry.facts import ContextExecutor
 __all__ = ["Turns"]
 
 T = TypeVar("T")
-_WEIGHT = 0.1  # of the latest work in the mean time that work takes
+_LATELY = 10  # pieces of work that say how long the next will take
 _MOST_WAITING = 2000
 _LOOKS_AFTER_S = 0.05  # of waiting: has the client gone?
 
 
 class Turns(ContextExecutor):
-    """`threads` at work at once. `submit` takes any work; `run` and `check` refuse what would wait too long."""
+    """`threads` at work at once. `submit` takes any work; `run` and `check` refuse what would wait too long, and `run`
+    what did, because nothing was known yet of how long work takes."""
 
     def __init__(self, threads: int, name: str, longest_wait_s: float) -> None:
         super().__init__(threads, thread_name_prefix=name)
         self._most_at_once, self._longest_wait_s = threads, longest_wait_s
-        self._pending, self._timed_ones, self._mean_s = 0, 0, 0.0
+        self._pending, self._mean_s = 0, 0.0
+        self._lately: deque[float] = deque(maxlen=_LATELY)
         self._counting = Lock()
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
@@ -60,7 +63,12 @@ class Turns(ContextExecutor):
         loop, came = asyncio.get_running_loop(), monotonic()
 
         def begin() -> T:
-            if gone is not None and monotonic() - came > _LOOKS_AFTER_S:
+            waited_s = monotonic() - came
+            if not admitted and waited_s > self._longest_wait_s:
+                raise Overloaded(
+                    f"its turn did not come within {waited_s:.0f} s; try again later", retry_after_s=waited_s
+                )
+            if gone is not None and waited_s > _LOOKS_AFTER_S:
                 left = asyncio.run_coroutine_threadsafe(_said(gone), loop)
                 if left.result():
                     raise Overloaded("the client has gone")
@@ -73,11 +81,9 @@ class Turns(ContextExecutor):
         try:
             return fn(*args, **kwargs)
         finally:
-            taken_s = monotonic() - start
-            with self._counting:  # one that is far slower, the first of all perhaps, says little of the others
-                self._timed_ones += 1
-                weight = max(_WEIGHT, 1.0 / self._timed_ones)
-                self._mean_s += weight * (min(taken_s, 3.0 * self._mean_s + 0.05) - self._mean_s)
+            with self._counting:  # the one that took longest, the first of all perhaps, says little of the others
+                self._lately.append(monotonic() - start)
+                self._mean_s = (sum(self._lately) - max(self._lately)) / max(len(self._lately) - 1, 1)
 
     def _done(self, _: Future[Any]) -> None:
         with self._counting:

@@ -4,9 +4,10 @@ The key never reaches the browser, and the API knows nothing of cookies: it sees
 """
 
 from http import HTTPStatus
-from http.cookies import SimpleCookie
+from urllib.parse import quote
 
 from starlette.datastructures import Headers
+from starlette.requests import cookie_parser
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app.viewer.requests import foreign_fetch, refusal, same_origin
@@ -32,8 +33,7 @@ class ApiDoor:
         if not ours:
             await refusal(HTTPStatus.FORBIDDEN, "only this server's own page may ask here")(scope, receive, send)
             return
-        cookie = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        session = await self._signed_in.find(cookie.value if cookie else None)
+        session = await self._signed_in.find(cookie_parser(headers.get("cookie", "")).get(self._cookie))
         if session is None:
             await refusal(HTTPStatus.UNAUTHORIZED, "sign in again")(scope, receive, send)
             return
@@ -43,13 +43,12 @@ class ApiDoor:
 def _with_key(scope: Scope, key: str) -> Scope:
     """The request as a client of the API would send it: its path from `/v1` on, the key and no cookie."""
     path = scope["path"][scope["path"].index("/v1/") :]
-    raw_path = scope.get("raw_path") or path.encode()
     kept = [(name, value) for name, value in scope["headers"] if name not in _NOT_PASSED_ON]
     return {
         **{name: value for name, value in scope.items() if name not in ("app", "router", "endpoint", "route")},
         "root_path": "",
         "path": path,
-        "raw_path": raw_path[raw_path.index(b"/v1/") :],
+        "raw_path": quote(path).encode(),
         "path_params": {},
         "headers": [*kept, (b"authorization", b"Bearer " + key.encode())],
     }

@@ -9,8 +9,10 @@ import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 
+from app.errors import Unavailable
 from app.services.reach import Reach
 from app.viewer.source import Authenticate, Identity, may_view
 
@@ -95,12 +97,18 @@ class SignedIn:
 
     async def until_ended(self, session: Session, every_s: float = RECHECK_SECONDS) -> None:
         """Return when the session signs out, expires or loses its key; looks `every_s` seconds, sooner near expiry."""
-        while await self.find(session.id) is not None:
+        while await self._lives(session):
             wait_s = max(0.05, min(every_s, session.expires_at - self._clock()))
             try:
                 await asyncio.wait_for(session.ended.wait(), wait_s)
             except TimeoutError:
                 continue
+
+    async def _lives(self, session: Session) -> bool:
+        try:
+            return await self.find(session.id) is not None
+        except (Unavailable, SQLAlchemyError):
+            return not session.ended.is_set()  # nobody can tell just now
 
     async def _identity(self, key: str) -> Identity | None:
         identity = await run_in_threadpool(self._authenticate, key)

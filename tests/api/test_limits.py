@@ -1,17 +1,22 @@
 """Limits of keys, organisations and the process: what is refused, how it says so, and that it ends."""
 
 import asyncio
+import gzip
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
 from starlette.testclient import TestClient
 
 import app.api.body as body_module
 from app.api.admission import Admission, BodyMemory
-from app.api.body import BodyLimit
+from app.api.auth import recognised
+from app.api.body import BodyLimit, upload
 from app.api.context import Context
 from app.api.key_limits import KeyLimits
 from app.db.tables import Floor, Survey
@@ -239,6 +244,31 @@ def test_bodies_share_so_much_memory_and_give_it_back() -> None:
     assert asyncio.run(scenario()) == [200, 503, 200, 200]
 
 
+def test_a_packed_file_that_does_not_say_so_takes_the_memory_of_what_it_unpacks_to() -> None:
+    async def scenario() -> None:
+        packed = gzip.compress(bytes(50_000))
+        memory, coming = BodyMemory(100_000, 0.05), [{"type": "http.request", "body": packed}] * 2
+        told = [(b"content-length", str(len(packed)).encode())]
+
+        async def receive() -> dict[str, Any]:
+            return coming.pop()
+
+        def request() -> Request:
+            return Request({"type": "http", "method": "POST", "path": "/", "headers": told}, receive)
+
+        async with memory.room(60_000):
+            with pytest.raises(Overloaded):
+                async with upload(request(), 50_000, memory):
+                    pass
+        async with upload(request(), 50_000, memory) as data:
+            assert data == bytes(50_000)
+            with pytest.raises(Overloaded):
+                memory.take(50_001)
+        memory.take(100_000)
+
+    asyncio.run(scenario())
+
+
 def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
     async def scenario() -> None:
         memory = BodyMemory(100, 5.0)
@@ -268,6 +298,42 @@ def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
     asyncio.run(scenario())
 
 
+def test_bodies_that_do_not_come_keep_nobody_out(tmp_path: Path) -> None:
+    """From somebody without a key: a request is open once its body is there."""
+    settings = Settings(data_dir=tmp_path, database_url=None, blob_url=None, admin_key=ADMIN, max_requests=2)
+    first_start(settings)
+    application = create_app(settings)
+    most = settings.body_memory_bytes // settings.max_body_bytes
+
+    async def ask(method: str, path: str, key: str = "", body: Messages | None = None) -> int:
+        coming, statuses = list(body or [part(0)]), []
+
+        async def receive() -> dict[str, Any]:
+            return coming.pop(0) if coming else await asyncio.sleep(60, {})
+
+        async def send(message: Any) -> None:
+            statuses.append(message.get("status"))
+
+        headers = [(b"authorization", f"Bearer {key}".encode())] if key else []
+        scope = {"type": "http", "http_version": "1.1", "scheme": "http", "method": method, "path": path,
+                 "query_string": b"", "headers": headers, "client": ("127.0.0.1", 1)}  # fmt: skip
+        await application(scope, receive, send)
+        return int(statuses[0])
+
+    async def scenario() -> None:
+        unfinished = part(settings.max_body_bytes, more=True)
+        held = [asyncio.create_task(ask("POST", "/v1/buildings", body=[unfinished])) for _ in range(most)]
+        await asyncio.sleep(0)
+        assert await ask("GET", "/v1/buildings", ADMIN) == 200
+        async with application.state.context.bodies.room(settings.max_upload_bytes):
+            pass
+        for each in held:
+            each.cancel()
+        await asyncio.gather(*held, return_exceptions=True)
+
+    asyncio.run(scenario())
+
+
 def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None:
     async def scenario() -> None:
         enough = asyncio.Event()
@@ -289,6 +355,53 @@ def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None
         assert (await exchange(admission, [part(0)]))[0]["status"] == 200
 
     asyncio.run(scenario())
+
+
+def test_a_key_is_known_however_many_slow_requests_there_are(context: tuple[Context, TestClient]) -> None:
+    made, _ = context
+
+    async def scenario() -> None:
+        enough = Event()
+        slow = [asyncio.create_task(run_in_threadpool(enough.wait, 60)) for _ in range(100)]
+        await asyncio.sleep(0.1)
+        made.keys._recent.clear()
+        try:
+            assert (await asyncio.wait_for(recognised(made, ADMIN), 20)).may("admin")
+        finally:
+            enough.set()
+            await asyncio.gather(*slow)
+
+    asyncio.run(scenario())
+
+
+def test_an_upload_that_would_wait_too_long_is_refused_before_it_is_read(
+    context: tuple[Context, TestClient], http: TestClient
+) -> None:
+    building = http.get("/v1/buildings").json()["items"][0]["id"]
+    floor = http.get(f"/v1/buildings/{building}/floors").json()["items"][0]["id"]
+    damaged = {"content": b"no gzip", "headers": {"Content-Encoding": "gzip"}}
+    assert http.post(f"/v1/floors/{floor}/surveys", **damaged).status_code == 422
+    enough = Event()
+    held = [context[0].uploads.submit(enough.wait, 60) for _ in range(2100)]
+    try:
+        assert http.post(f"/v1/floors/{floor}/surveys", **damaged).status_code == 503
+        assert http.put(f"/v1/floors/{floor}/plan?metres_per_pixel=1", **damaged).status_code == 503
+    finally:
+        enough.set()
+    assert all(each.result() for each in held)
+
+
+def test_a_database_that_is_away_keeps_no_server_from_stopping(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, database_url=None, blob_url=None, admin_key=ADMIN)
+    first_start(settings)
+    application = create_app(settings)
+    made: Context = application.state.context
+    with TestClient(application, headers={"Authorization": f"Bearer {ADMIN}"}) as http:
+        assert http.get("/v1/buildings").status_code == 200
+        made.files.start()
+        with made.engine.begin() as connection:
+            connection.exec_driver_sql('ALTER TABLE "key" RENAME TO away')
+    assert made.files._program is None, "what comes after was done, too"
 
 
 def test_an_upload_larger_than_it_may_be_is_refused_by_its_header(http: TestClient, tmp_path: Path) -> None:

@@ -107,6 +107,27 @@ def step_message(step: dict[str, Any]) -> str:
     return json.dumps({"type": "step", **step})
 
 
+def test_a_stream_is_refused_in_good_order_while_the_database_is_away(served: Served) -> None:
+    track = served.new_track()
+    context = served.app.state.context
+    with context.engine.begin() as connection:
+        connection.exec_driver_sql("ALTER TABLE track RENAME TO away")
+
+    async def scenario() -> None:
+        with pytest.raises(InvalidStatus) as refused:
+            async with served.stream(track):
+                pass
+        assert refused.value.response.status_code == 503
+        assert json.loads(refused.value.response.body or b"")["type"].endswith("/unavailable")
+        assert refused.value.response.headers["Retry-After"] == "5"
+
+    try:
+        asyncio.run(scenario())
+    finally:
+        with context.engine.begin() as connection:
+            connection.exec_driver_sql("ALTER TABLE away RENAME TO track")
+
+
 def test_fifty_steps_a_second_are_answered_as_they_come(served: Served, hall_steps: Callable[..., Steps]) -> None:
     """One step a message, as a device takes them; what is answered is the same as by POST, bit for bit."""
     steps, track = hall_steps(count=100), served.new_track()

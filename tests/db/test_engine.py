@@ -1,19 +1,24 @@
 """The schema by migration is the schema of the tables, up and down, on both databases."""
 
 import os
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import Connection, Engine, inspect, select, text
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy import Connection, Engine, event, inspect, select, text
+from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session, sessionmaker
 
+import app.db.engine as engine_module
 from app.db.engine import create_database_engine, downgrade, migrate, teach_old_sqlite
 from app.db.tables import Base, Map, Organisation, Survey
 from app.errors import InvalidInput
@@ -49,6 +54,36 @@ def test_an_error_does_not_quote_what_was_written(engine: Engine) -> None:
         connection.execute(statement, {"position": "12.345 m"})
     assert "INSERT INTO nowhere" in str(caught.value)
     assert "12.345" not in str(caught.value)
+
+
+def test_a_database_that_does_not_answer_is_given_up_soon() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent, ThreadPoolExecutor(1) as pool:
+        engine = create_database_engine(f"postgresql://somebody@127.0.0.1:{silent.getsockname()[1]}/somewhere")
+        connecting = pool.submit(engine.connect)
+        try:
+            assert isinstance(connecting.exception(30.0), OperationalError)
+        finally:
+            silent.close()  # ends the attempt in any case
+
+
+def test_an_address_may_say_how_long_a_database_is_waited_for() -> None:
+    engine = create_database_engine("postgresql://somebody@127.0.0.1:1/somewhere?connect_timeout=2&tcp_user_timeout=9")
+    asked: list[dict[str, object]] = []
+    event.listen(engine, "do_connect", lambda *args: asked.append(args[3]))
+    with pytest.raises(OperationalError):
+        engine.connect()
+    assert [asked[0][name] for name in ("connect_timeout", "tcp_user_timeout", "keepalives_idle")] == ["2", "9", 10]
+
+
+def test_whoever_finds_every_connection_taken_is_told_soon(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_module, "POOL_TIMEOUT_S", 0.05)
+    narrow = create_database_engine(engine.url.render_as_string(hide_password=False))
+    with ExitStack() as held:
+        for _ in range(narrow.pool.size() + narrow.pool._max_overflow):  # type: ignore[attr-defined]
+            held.enter_context(narrow.connect())
+        with pytest.raises(PoolTimeout):
+            narrow.connect()
+    narrow.dispose()
 
 
 def test_down_and_up_again(engine: Engine, database_url: str) -> None:

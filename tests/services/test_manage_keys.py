@@ -5,7 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 
 import pytest
+<<<<<<< HEAD
 from sqlalchemy import select, update
+=======
+from sqlalchemy import event, select
+>>>>>>> review-a
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Audit, Key, utc_now
@@ -37,6 +41,27 @@ def test_a_revoked_key_is_forgotten_within_seconds(
     now += key_ring.RECENT_S
     assert ring.recent(secret) is None
     assert ring.recognise("isd_guess") is None
+
+
+def test_uses_are_written_in_one_order_by_all_processes(sessions: sessionmaker[Session]) -> None:
+    with sessions.begin() as session:
+        secrets = [create_key(session, organisation="mine", name=f"{k}", scopes=["locate"]) for k in range(3)]
+    orders: list[list[str]] = []
+
+    def note(_c: object, _u: object, statement: str, rows: list[dict[str, str]], *_: object) -> None:
+        orders.append([next(str(v) for v in (row.values() if isinstance(row, dict) else row) if str(v) in ids)
+                       for row in rows])  # fmt: skip
+
+    ids: set[str] = set()
+    engine = sessions.kw["bind"]
+    for told in (secrets, secrets[::-1]):
+        ring = KeyRing(sessions)
+        found = [ring.recognise(secret) for secret in told]
+        ids.update(each.key_id for each in found if each is not None)
+        event.listen(engine, "before_cursor_execute", note)
+        ring.note_uses()
+        event.remove(engine, "before_cursor_execute", note)
+    assert orders == [sorted(ids)] * 2
 
 
 def test_each_process_forgets_by_itself_within_its_two_seconds(

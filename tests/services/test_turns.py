@@ -41,6 +41,37 @@ def test_one_slow_work_does_not_close_the_door(turns: Turns) -> None:
     enough.set()
 
 
+def test_what_work_takes_is_known_soon_after_a_start(turns: Turns) -> None:
+    for _ in range(2):
+        turns.submit(time.sleep, 0.6).result()
+    enough = Event()
+    held = [turns.submit(enough.wait, 60) for _ in range(3)]
+    try:
+        with pytest.raises(Overloaded):
+            turns.check()
+    finally:
+        enough.set()
+    assert all(each.result() for each in held)
+
+
+def test_nobody_waits_longer_than_may_be_when_nothing_is_known_yet(turns: Turns) -> None:
+    done = []
+
+    async def scenario() -> None:
+        enough = Event()
+        turns.submit(enough.wait, 60)
+        late = asyncio.create_task(turns.run(lambda: done.append("late")))
+        part = asyncio.create_task(turns.run(lambda: done.append("part"), admitted=True))
+        await asyncio.sleep(0.6)
+        enough.set()
+        with pytest.raises(Overloaded, match="did not come"):
+            await late
+        await part
+
+    asyncio.run(scenario())
+    assert done == ["part"]
+
+
 def test_work_is_not_done_for_a_client_that_has_gone(turns: Turns) -> None:
     done = []
 

@@ -40,6 +40,19 @@ def test_nobody_gets_through_without_a_session(running, cookie):
         assert client.get("/view/v1/buildings", headers=headers).status_code == 401
 
 
+@pytest.mark.parametrize("others", ['a={"b": 1}; ', "a/b=1; "])
+def test_cookies_of_other_pages_on_the_host_close_no_door(running, others):
+    with running.client() as client:
+        headers = {"Cookie": others + running.cookie("north-key")}
+        assert client.get("/view/v1/buildings", headers=headers).status_code == 200
+
+
+def test_a_path_may_be_written_with_escapes(running):
+    with running.client() as client:
+        headers = {"Cookie": running.cookie("north-key")}
+        assert client.get("/view/%76%31/buildings", headers=headers).json()["path"] == "/v1/buildings"
+
+
 @pytest.mark.parametrize("method", ["POST", "PATCH", "DELETE"])
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", None])
 def test_another_sites_page_changes_nothing(running, method, origin):
