@@ -105,15 +105,10 @@ class KeyRing:
         return identity
 
     def note_uses(self) -> None:
-<<<<<<< HEAD
         """Write down when keys were last used. Called now and then, so that no request waits for it.
 
         In order of their ids: processes that write of the same keys wait for each other, and never in a circle.
         """
-=======
-        """Write down when keys were last used. Called now and then, so that no request waits for it. In order of id:
-        several processes that do so at once wait for each other, and never in a circle."""
->>>>>>> review-a
         used, self._used = self._used, {}
         if used:
             with self._sessions.begin() as session:

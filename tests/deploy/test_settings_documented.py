@@ -18,7 +18,7 @@ ROWS = {
 }
 NAMED = set(re.findall(r"`((?:ISODYN|AWS|OTEL)_[A-Z0-9_]+)", TEXT))
 FIELDS = {f"ISODYN_{name.upper()}": field for name, field in Settings.model_fields.items()}
-UNITS = {"": 1, "MiB": 2**20, "GiB": 2**30}
+UNITS = {"": 1, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 OF_LIBRARIES = {
     "AWS_SESSION_TOKEN", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY",
 }  # fmt: skip
@@ -49,6 +49,8 @@ def test_every_setting_has_its_row_and_default(name: str) -> None:
     elif isinstance(default, (int, float)):
         number, _, unit = told.partition(" ")
         assert float(number.replace(",", "")) * UNITS[unit] == default
+    elif default == "":
+        assert told == "none"
     elif default is not None:
         assert told.removeprefix("./") == str(default)
 

@@ -5,11 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 
 import pytest
-<<<<<<< HEAD
-from sqlalchemy import select, update
-=======
-from sqlalchemy import event, select
->>>>>>> review-a
+from sqlalchemy import event, select, update
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Audit, Key, utc_now
