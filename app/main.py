@@ -246,8 +246,9 @@ def _cross_origin(origins: str) -> dict[str, Any]:
             "Idempotency-Key",
             "If-Match",
             "If-None-Match",
+            "X-Request-ID",
         ],
-        "expose_headers": ["ETag", "Link", "RateLimit", "RateLimit-Policy", "Retry-After"],
+        "expose_headers": ["ETag", "Link", "RateLimit", "RateLimit-Policy", "Retry-After", "X-Request-ID"],
     }
 
 

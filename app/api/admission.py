@@ -17,25 +17,29 @@ _IN_SCOPE = "isodyn.admitted"
 
 
 class Admission:
-    """At most so many requests at one time, whoever asks; whether the process is well can be asked always."""
+    """At most so many requests at one time, whoever asks, and beside them a quarter as many streams of events, which
+    stay open for long; whether the process is well can be asked always."""
 
     def __init__(self, app: ASGIApp, most: int) -> None:
-        self.app, self.most, self.open = app, most, 0
+        self.app = app
+        self._most = {"requests": most, "streams of events": max(most // 4, 1)}
+        self._open = dict.fromkeys(self._most, 0)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or scope["path"] in ALWAYS or _IN_SCOPE in scope:
             await self.app(scope, receive, send)
             return
-        if self.open >= self.most:
-            error = Overloaded(f"{self.most} requests are open, the most; try again in a moment", retry_after_s=1.0)
-            await isodyn_problem(error)(scope, receive, send)
+        kind = "streams of events" if scope["path"].endswith("/events") else "requests"
+        if self._open[kind] >= self._most[kind]:
+            told = f"{self._most[kind]} {kind} are open, the most; try again in a moment"
+            await isodyn_problem(Overloaded(told, retry_after_s=1.0))(scope, receive, send)
             return
         scope[_IN_SCOPE] = True
-        self.open += 1
+        self._open[kind] += 1
         try:
             await self.app(scope, receive, send)
         finally:
-            self.open -= 1
+            self._open[kind] -= 1
 
 
 class BodyMemory:

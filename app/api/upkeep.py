@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections.abc import Callable
 
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.exc import SQLAlchemyError
@@ -21,10 +22,7 @@ WARM_EVERY_S = 2.0
 async def keep_up(context: Context) -> None:
     """Keys were used, the log grows old, and so do the keys of an issuer."""
     while True:
-        try:
-            await run_in_threadpool(_once, context)
-        except SQLAlchemyError as error:
-            _log.warning("upkeep is tried again in a minute: %s", error)
+        await _tried(_once, context)
         await asyncio.sleep(EVERY_S)
 
 
@@ -48,20 +46,24 @@ async def keep_maps_warm(context: Context) -> None:
     """A new map of a floor that is asked for is in memory before the next who asks."""
     while True:
         await asyncio.sleep(WARM_EVERY_S)
-        try:
-            await run_in_threadpool(keep_warm, context.engine, context.grids)
-        except (SQLAlchemyError, IsodynError) as error:
-            _log.warning("maps were not made ready, which is tried again: %s", error)
+        await _tried(keep_warm, context.engine, context.grids)
 
 
 async def end_idle_tracks(context: Context) -> None:
     """Whoever asks meanwhile is told by the time, not by this."""
     while True:
         await asyncio.sleep(min(60.0, max(context.settings.track_idle_timeout_s / 4.0, 1.0)))
-        try:
-            await run_in_threadpool(context.follower.end_idle)
-        except SQLAlchemyError as error:
-            _log.warning("idle tracks were not ended, which is tried again: %s", error)
+        await _tried(context.follower.end_idle)
+
+
+async def _tried(work: Callable[..., object], *arguments: object) -> None:
+    """Do it in a thread; whatever goes wrong, it is tried again."""
+    try:
+        await run_in_threadpool(work, *arguments)
+    except (SQLAlchemyError, IsodynError) as error:
+        _log.warning("upkeep is tried again: %s", error)
+    except Exception:
+        _log.exception("upkeep failed, and is tried again")
 
 
 BACKGROUND = (keep_up, keep_maps_warm, end_idle_tracks)

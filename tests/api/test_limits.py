@@ -357,6 +357,28 @@ def test_so_many_requests_are_open_and_health_is_answered_all_the_same() -> None
     asyncio.run(scenario())
 
 
+def test_streams_of_events_take_no_room_from_requests() -> None:
+    async def scenario() -> None:
+        enough = asyncio.Event()
+
+        async def slow(scope: Any, receive: Any, send: Any) -> None:
+            if scope["path"].endswith("/events"):
+                await enough.wait()
+            await ok(scope, receive, send)
+
+        admission = Admission(slow, 4)
+        held = asyncio.create_task(exchange(admission, [part(0)], "/v1/jobs/a/events"))
+        await asyncio.sleep(0)
+        refused = await exchange(admission, [part(0)], "/v1/jobs/b/events")
+        assert refused[0]["status"] == 503
+        assert (await exchange(admission, [part(0)]))[0]["status"] == 200
+        enough.set()
+        assert (await held)[0]["status"] == 200
+        assert (await exchange(admission, [part(0)], "/v1/jobs/b/events"))[0]["status"] == 200
+
+    asyncio.run(scenario())
+
+
 def test_a_key_is_known_however_many_slow_requests_there_are(context: tuple[Context, TestClient]) -> None:
     made, _ = context
 
