@@ -104,7 +104,7 @@ def open_context(settings: Settings) -> Context:
     tokens = None if settings.oidc_issuer is None else _open_tokens(settings)
     grids = GridCache(blobs, settings.grid_cache_bytes)
     threads = min(os.cpu_count() or 1, MOST_SEARCHES)
-    follows = Turns(threads, "follow", settings.max_wait_s)
+    follows = Turns(threads, "follow", settings.max_wait_s, patient=True)
     return Context(
         settings=settings,
         engine=engine,
@@ -125,7 +125,7 @@ def open_context(settings: Settings) -> Context:
             survey_bytes=settings.max_survey_bytes,
         ),
         bodies=BodyMemory(settings.body_memory_bytes - settings.body_memory_bytes // 4, settings.max_wait_s),
-        searches=Turns(threads, "search", settings.max_wait_s),
+        searches=Turns(threads, "search", settings.max_wait_s, patient=True),
         follows=follows,
         uploads=Turns(settings.parse_processes, "upload", settings.max_upload_wait_s),
         follower=Follower(
@@ -155,7 +155,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        Thread(target=_get_ready, name="warm-up", daemon=True).start()
+        Thread(target=_get_ready, args=(context,), name="warm-up", daemon=True).start()
         tasks = [asyncio.create_task(work(context)) for work in BACKGROUND]
         yield
         for task in tasks:
@@ -218,14 +218,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-def _get_ready() -> None:
-    """Warm up, then let the garbage collector forget all that is there by now.
+def _get_ready(context: Context) -> None:
+    """Warm up, then have nobody wait too long, and let the garbage collector forget all that is there by now.
 
     These objects (modules, compiled kernels, the application) stay as long as the process. To look through them stops
     every thread for more than 0.1 s, and a busy server would do so about once a second.
     """
     warm_up()
+    context.searches.hurry()
     warm_up_tracks()
+    context.follows.hurry()
     gc.collect()
     gc.freeze()
 

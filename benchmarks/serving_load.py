@@ -123,6 +123,7 @@ def server(folder: Path, cores: set[int] | None = None) -> Iterator[tuple[int, i
     process = subprocess.Popen([*hold, sys.executable, "-m", "app.cli", "serve", "--no-worker"], env=environment)
     try:
         wait_until_ready(port, start)
+        time.sleep(5.0)  # warming up goes on beside the first answers
         yield process.pid, port
     finally:
         process.terminate()

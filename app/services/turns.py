@@ -24,14 +24,25 @@ _LOOKS_AFTER_S = 0.05  # of waiting: has the client gone?
 
 class Turns(ContextExecutor):
     """`threads` at work at once. `submit` takes any work; `run` and `check` refuse what would wait too long, and `run`
-    what did, because nothing was known yet of how long work takes."""
+    what did, because nothing was known yet of how long work takes.
 
-    def __init__(self, threads: int, name: str, longest_wait_s: float) -> None:
+    As long as it is `patient` nobody is refused for that: a first start compiles for a minute, and then is quick.
+    """
+
+    def __init__(self, threads: int, name: str, longest_wait_s: float, patient: bool = False) -> None:
         super().__init__(threads, thread_name_prefix=name)
+        self.patient = patient
         self._most_at_once, self._longest_wait_s = threads, longest_wait_s
         self._pending, self._mean_s = 0, 0.0
         self._lately: deque[float] = deque(maxlen=_LATELY)
         self._counting = Lock()
+
+    def hurry(self) -> None:
+        """Be patient no more; what work took so far was a start's."""
+        with self._counting:
+            self.patient = False
+            self._lately.clear()
+            self._mean_s = 0.0
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         with self._counting:
@@ -48,7 +59,7 @@ class Turns(ContextExecutor):
     def check(self) -> None:
         """Raise Overloaded when work would wait too long; `retry_after_s` is when what waits will have been done."""
         wait_s = self.expected_wait_s
-        if wait_s > self._longest_wait_s or self._pending > _MOST_WAITING:
+        if (wait_s > self._longest_wait_s and not self.patient) or self._pending > _MOST_WAITING:
             raise Overloaded(
                 f"{self._pending} others wait already, about {wait_s:.0f} s; try again later", retry_after_s=wait_s
             )
@@ -60,11 +71,11 @@ class Turns(ContextExecutor):
         whole; and when `gone` says that nobody waits for it any more. Then it is not done."""
         if not admitted:
             self.check()
-        loop, came = asyncio.get_running_loop(), monotonic()
+        loop, came, patient = asyncio.get_running_loop(), monotonic(), self.patient
 
         def begin() -> T:
             waited_s = monotonic() - came
-            if not admitted and waited_s > self._longest_wait_s:
+            if not admitted and not patient and waited_s > self._longest_wait_s:
                 raise Overloaded(
                     f"its turn did not come within {waited_s:.0f} s; try again later", retry_after_s=waited_s
                 )

@@ -72,6 +72,24 @@ def test_nobody_waits_longer_than_may_be_when_nothing_is_known_yet(turns: Turns)
     assert done == ["part"]
 
 
+def test_whoever_comes_while_the_process_starts_waits() -> None:
+    """Compiling may take a minute, once: it says nothing of what follows."""
+    turns = Turns(1, "turn", 0.1, patient=True)
+
+    async def scenario() -> None:
+        enough = Event()
+        turns.submit(enough.wait, 60)
+        early = [asyncio.create_task(turns.run(lambda: "answer")) for _ in range(3)]
+        await asyncio.sleep(0.3)
+        enough.set()
+        assert await asyncio.gather(*early) == ["answer"] * 3
+        turns.hurry()
+        turns.check()
+
+    asyncio.run(scenario())
+    turns.shutdown()
+
+
 def test_work_is_not_done_for_a_client_that_has_gone(turns: Turns) -> None:
     done = []
 
