@@ -38,11 +38,8 @@ class Turns(ContextExecutor):
         self._counting = Lock()
 
     def hurry(self) -> None:
-        """Be patient no more; what work took so far was a start's."""
-        with self._counting:
-            self.patient = False
-            self._lately.clear()
-            self._mean_s = 0.0
+        """Be patient no more; what was begun until now says nothing of what follows."""
+        self.patient = False
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         with self._counting:
@@ -88,13 +85,17 @@ class Turns(ContextExecutor):
         return await loop.run_in_executor(self, begin)
 
     def _timed(self, fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-        start = monotonic()
+        start, starting = monotonic(), self.patient
         try:
             return fn(*args, **kwargs)
         finally:
-            with self._counting:  # the one that took longest, the first of all perhaps, says little of the others
-                self._lately.append(monotonic() - start)
-                self._mean_s = (sum(self._lately) - max(self._lately)) / max(len(self._lately) - 1, 1)
+            if not starting:
+                self._note(monotonic() - start)
+
+    def _note(self, taken_s: float) -> None:
+        with self._counting:  # the one that took longest, the first of all perhaps, says little of the others
+            self._lately.append(taken_s)
+            self._mean_s = (sum(self._lately) - max(self._lately)) / max(len(self._lately) - 1, 1)
 
     def _done(self, _: Future[Any]) -> None:
         with self._counting:
