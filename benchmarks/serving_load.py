@@ -262,10 +262,11 @@ def load(folder: Path, clients: Clients) -> bool:
             hot = answered[answered[:, 1] == 0, 0]
             cold = answered[answered[:, 1] == 1, 0]
             p50, p99 = np.quantile(answered[:, 0], [0.5, 0.99])
+            cold_ms = f"{np.median(cold):.1f} ms" if len(cold) else "none came"
             print(
-                f"open loop at {filled:.0%} ({len(came)} windows, {len(came) - len(answered)} refused): p50 {p50:.1f}, p99 {p99:.1f} ms, "
-                f"{p99 / p50:.1f} times; "
-                f"hot buildings p99 {np.quantile(hot, 0.99):.1f}, cold ones p50 {np.median(cold):.1f} ms"
+                f"open loop at {filled:.0%} ({len(came)} windows, {len(came) - len(answered)} refused): "
+                f"p50 {p50:.1f}, p99 {p99:.1f} ms, {p99 / p50:.1f} times; "
+                f"hot buildings p99 {np.quantile(hot, 0.99):.1f}, cold ones p50 {cold_ms}"
             )
             passed &= filled != FILLED or (p99 <= MOST_TAIL * p50 and len(answered) == len(came))
     print(f"at {FILLED:.0%} p99 at most {MOST_TAIL:.0f} times p50: {'met' if passed else 'MISSED'}")
