@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.db.tables import BUILD, REBUILD, Floor, Job, Map
 from app.errors import NotFound
-from app.jobs.admission import LOW, NORMAL, admit_next
+from app.jobs.admission import IN_HAND, LOW, NORMAL, admit_next
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from app.telemetry.facts import request_id
 from app.telemetry.tracing import traceparent
@@ -113,8 +113,8 @@ class JobQueue:
         session.execute(begun.values(status="accepted"))
 
     def recorded(self, session: Session) -> Iterator[object]:
-        """What the engine has recorded of the steps of every job that has not ended: plans and results."""
-        for workflow_id in session.scalars(select(Job.workflow_id).where(Job.status.not_in(FINAL_STATES))).all():
+        """What the engine has recorded of the steps of every job in hand: plans and results. What waits has none."""
+        for workflow_id in session.scalars(select(Job.workflow_id).where(IN_HAND)).all():
             for step in self._client.list_workflow_steps(workflow_id):
                 yield step["output"]
 

@@ -44,6 +44,7 @@ def test_it_waits_for_the_database_migrates_and_makes_a_key(postgres_url: str, t
     assert at == head
 
 
+@pytest.mark.slow
 def test_it_says_that_it_waited_in_vain(tmp_path: Path) -> None:
     nowhere = f"postgresql+psycopg://isodyn:hunter2@127.0.0.1:{free_port()}/isodyn"
     run = subprocess.run(

@@ -27,7 +27,8 @@ def _floor_with_surveys(server: Any, walk_csv: Callable[[int], bytes]) -> str:
     return str(floor)
 
 
-@pytest.mark.parametrize("victim", ["everything", pytest.param("worker and fit", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", ["everything", "worker and fit"])
 def test_a_fit_survives_kill_9_and_its_map_is_identical(
     server: Any, walk_csv: Callable[[int], bytes], victim: str
 ) -> None:
@@ -50,6 +51,7 @@ def test_a_fit_survives_kill_9_and_its_map_is_identical(
     assert maps[1]["active"]
 
 
+@pytest.mark.slow
 def test_kill_9_during_an_upload_leaves_no_half_survey(server: Any, walk_csv: Callable[[int], bytes]) -> None:
     floor = server.new_floor()
     data = walk_csv(1)
@@ -65,6 +67,7 @@ def test_kill_9_during_an_upload_leaves_no_half_survey(server: Any, walk_csv: Ca
     assert server.wait_for(answer.json()["job"]["id"])["status"] == "successful"
 
 
+@pytest.mark.slow
 def test_a_stream_of_uploads_with_kills_loses_nothing_acknowledged(
     server: Any, walk_csv: Callable[[int], bytes]
 ) -> None:

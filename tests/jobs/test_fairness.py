@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+import pytest
 from sqlalchemy import select
 
 from app.db.tables import Floor, Job
@@ -10,6 +11,7 @@ if TYPE_CHECKING:
     from conftest import Crew, Site
 
 
+@pytest.mark.slow
 def test_two_hundred_waiting_floors_of_another_organisation_are_no_obstacle(crew: "Crew", site: "Site") -> None:
     many = site.floors(200, sleep_s=0.2)
     with site.sessions.begin() as session:

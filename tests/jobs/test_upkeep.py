@@ -53,6 +53,7 @@ def upkeep(engine: Engine, sessions: sessionmaker[Session], days: float = 1.0, t
         client.destroy()
 
 
+@pytest.mark.slow
 def test_after_two_thousand_jobs_the_engines_tables_are_small_and_new_jobs_run(
     crew: "Crew", site: "Site", engine: Engine, sessions: sessionmaker[Session]
 ) -> None:

@@ -145,6 +145,7 @@ def test_a_request_its_statements_and_its_job_are_one_story(
     assert not [word for word in (building, "House", KEY) if word in told]
 
 
+@pytest.mark.slow
 def test_a_collector_that_is_slow_does_not_hold_up_a_fit(
     collector: Collector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
