@@ -141,9 +141,8 @@ def open_context(settings: Settings) -> Context:
 
 
 def _open_tokens(settings: Settings) -> "BearerTokens":
-    from app.api.bearer_tokens import (
-        BearerTokens,  # takes a quarter of a second; few installations need it
-    )
+    # Takes a quarter of a second, and few installations need it.
+    from app.api.bearer_tokens import BearerTokens
 
     return BearerTokens(settings)
 

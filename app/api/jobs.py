@@ -18,13 +18,13 @@ from app.api.models import Id
 from app.api.ownership import find_own, own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Job
+from app.jobs import FINAL_STATES
 from app.services.audit_log import record
 
 __all__ = ["JobView", "router", "show_job"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=ERROR_RESPONSES)
 JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
-FINAL = frozenset({"successful", "failed", "dismissed"})
 
 
 class JobView(BaseModel):
@@ -81,7 +81,7 @@ def cancel_job(job_id: Id, request: Request, context: ContextDep, identity: MapW
     """A waiting job is dismissed at once; a running one when it next reports progress; an ended one stays as it is."""
     with context.transaction() as session:
         job = find_own(session, identity, Job, job_id)
-        if job.status not in FINAL:
+        if job.status not in FINAL_STATES:
             context.queue.request_cancel(session, job)
             record(session, actor(request, identity), "cancel", job, floor_id=job.floor_id)
         return show_job(job)
@@ -111,7 +111,7 @@ async def job_events(job_id: Id, request: Request, context: ContextDep, identity
                 if content != sent:
                     sent = content
                     yield {"event": "status", "data": json.dumps(content)}
-                if view.status in FINAL or await request.is_disconnected():
+                if view.status in FINAL_STATES or await request.is_disconnected():
                     return
                 await asyncio.sleep(0.5)
                 view = await run_in_threadpool(read)

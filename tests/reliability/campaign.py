@@ -25,13 +25,13 @@ from typing import Any, Self, cast
 import httpx
 import numpy as np
 
+from app.jobs import FINAL_STATES
 from app.synthetic.hall import hall_uT
 from tests.reliability.installation import KEY, BackEnd, Installation, installation
 
 __all__ = ["Seen", "run_campaign"]
 
 NOISE_UT = 0.4
-FINAL = ("successful", "failed", "dismissed")
 REFUSED = (503, 507)  # told to come again: nothing was acknowledged
 PATIENCE_S = 300.0
 FLOORS = 6
@@ -251,7 +251,9 @@ def _wait_for_jobs(client: Client, seen: Seen) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while True:
         jobs = list(client.pages("/v1/jobs?limit=200"))
-        seen.unended = [f"{job['id']} {job['status']}: {job['message']}" for job in jobs if job["status"] not in FINAL]
+        seen.unended = [
+            f"{job['id']} {job['status']}: {job['message']}" for job in jobs if job["status"] not in FINAL_STATES
+        ]
         if not seen.unended or time.monotonic() > deadline:
             break
         time.sleep(0.5)
@@ -260,7 +262,7 @@ def _wait_for_jobs(client: Client, seen: Seen) -> None:
 
 def _ended(client: Client, job_id: str) -> Any:
     deadline = time.monotonic() + PATIENCE_S
-    while (job := client.ask("GET", f"/v1/jobs/{job_id}"))["status"] not in FINAL:
+    while (job := client.ask("GET", f"/v1/jobs/{job_id}"))["status"] not in FINAL_STATES:
         assert time.monotonic() < deadline, job
         time.sleep(0.2)
     assert job["status"] == "successful", job
