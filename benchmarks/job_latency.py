@@ -34,7 +34,7 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
     return {"claimed_at": time.time()}
 
 
-def fit_build(plan: dict[str, Any], _blobs: object, _progress: object) -> dict[str, Any]:
+def fit_build(plan: dict[str, Any], _blobs: object, _progress: object, _board: object) -> dict[str, Any]:
     return plan
 
 

@@ -43,7 +43,7 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
     return {"cost_s": session.get_one(Map, job.map_id).spec["cost_s"], "claimed_at": time.time()}
 
 
-def fit_build(plan: dict[str, Any], _blobs: object, _progress: object) -> dict[str, Any]:
+def fit_build(plan: dict[str, Any], _blobs: object, _progress: object, _board: object) -> dict[str, Any]:
     began, cpu_s = time.time(), time.process_time()
     while time.process_time() - cpu_s < plan["cost_s"]:
         sum(range(1000))

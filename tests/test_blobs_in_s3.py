@@ -252,7 +252,7 @@ def test_a_fit_s_process_has_a_client_of_its_own(address: str, tmp_path: Path, m
     store.put(b"the parent's client is in use")
     plan = {"floor_id": "f", "map_id": "m", "surveys": ["one"], "sleep_s": 0.1}
     fits = FitProcesses()
-    result = fits.run("tests.jobs.fake_builder", plan, address, lambda fraction, message: None)
+    result = fits.run("tests.jobs.fake_builder", {"plan": plan}, address, lambda fraction, message: None)
     fits.close()
     assert re.search(r"[0-9a-f]{64}", str(result))
     assert len(list(store.stored())) == 2
@@ -265,7 +265,7 @@ def test_a_fit_without_its_blobs_is_worth_another_try(
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
     plan = {"floor_id": "f", "map_id": "m", "surveys": ["one"], "sleep_s": 0.1}
     with pytest.raises(Unavailable, match="cannot be reached"):
-        FitProcesses().run("tests.jobs.fake_builder", plan, address, lambda fraction, message: None)
+        FitProcesses().run("tests.jobs.fake_builder", {"plan": plan}, address, lambda fraction, message: None)
 
 
 def test_the_doctor_writes_and_reads_and_leaves_nothing(s3: Server, address: str, tmp_path: Path) -> None:

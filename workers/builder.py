@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from sqlalchemy.orm import Session
 
 from app.blobs import BlobStore
+
+if TYPE_CHECKING:  # mathematics that only children need
+    from app.services.shared_tiles import Board
 
 __all__ = ["DEFAULT_BUILDER", "Builder", "Plan", "Result", "load_builder"]
 
@@ -24,8 +27,17 @@ class Builder(Protocol):
         """Mark the job running and fix what it builds."""
         ...
 
-    def fit_build(self, plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
-        """Compute, in a process of its own. `progress(fraction, message)` raises JobCancelled."""
+    def fit_build(self, plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None], board: "Board") -> Result:
+        """Compute, in a process of its own. `progress(fraction, message)` raises JobCancelled.
+
+        Large work may be offered to other workers on the `board`.
+        """
+        ...
+
+    def fit_chunk(
+        self, order_sha256: str, number: int, blobs: BlobStore, progress: Callable[[float, str], None]
+    ) -> Result:
+        """Compute what another worker offered, in a process of its own. The result's `fits_sha256` is brought to it."""
         ...
 
     def publish_build(self, session: Session, job_id: str, plan: Plan, result: Result) -> None:

@@ -1,8 +1,8 @@
 """The child of `workers.fit_process`: takes orders for fits, one after the other, and answers them.
 
-A line of JSON on standard input is an order, the word `cancel` is for the fit that runs. Answers are lines of JSON on
-standard output: progress, and at the end a result or an error, with whether another order may come. A parent that dies
-closes the pipe, and the child ends.
+A line of JSON on standard input is an order, or tells who took which of the tiles the fit offered; the word `cancel` is
+for the fit that runs. Answers are lines of JSON on standard output: progress, tiles offered to others, and at the end a
+result or an error, with whether another order may come. A parent that dies closes the pipe, and the child ends.
 """
 
 import json
@@ -13,7 +13,7 @@ import resource
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ class _Orders:
 
     def __init__(self) -> None:
         self.cancelled = threading.Event()
+        self.taken: dict[str, Any] = {}
         self._waiting: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         threading.Thread(target=self._hear, daemon=True).start()
 
@@ -57,9 +58,35 @@ class _Orders:
         for line in sys.stdin:
             if line.strip() == "cancel":
                 self.cancelled.set()
+                continue
+            said = json.loads(line)
+            if "taken" in said:
+                self.taken = said
             else:
-                self._waiting.put(json.loads(line))
+                self._waiting.put(said)
         os._exit(ORPHANED)
+
+
+class _Board:
+    """Where a fit offers its tiles to other workers (`app.services.shared_tiles.Board`): the parent has it."""
+
+    def __init__(self, say: Callable[[dict[str, Any]], None], orders: _Orders) -> None:
+        self._say, self._orders = say, orders
+        self._order_sha256 = ""
+
+    def offer(self, order_sha256: str, chunks: int) -> None:
+        self._order_sha256 = order_sha256
+        self._say({"offer": {"order_sha256": order_sha256, "chunks": chunks}})
+
+    def begin(self, chunk: int) -> None:
+        self._say({"begin": chunk})
+
+    def taken(self) -> Mapping[int, str | None]:
+        said = self._orders.taken
+        return dict(said["taken"]) if said.get("order_sha256") == self._order_sha256 else {}
+
+    def withdraw(self) -> None:
+        self._say({"withdraw": True})
 
 
 def main() -> None:
@@ -72,18 +99,21 @@ def main() -> None:
     configure_tracing(settings.otel, "isodyn-fit")
     orders = _Orders()
 
+    def say(answer: dict[str, Any]) -> None:
+        answers.write(json.dumps(answer) + "\n")
+
     def progress(fraction: float, message: str) -> None:
         if orders.cancelled.is_set():
             raise JobCancelled("the job was asked to stop")
-        answers.write(json.dumps({"fraction": fraction, "message": message}) + "\n")
+        say({"fraction": fraction, "message": message})
 
     kept = True
     while kept and (order := orders.next()) is not None:
         attach(traced_from(order.get("trace")))
         with with_facts(**order.get("facts", {})):  # what it logs and traces belongs to the job that it works for
-            answer = _answer(order, progress)
+            answer = _answer(order, progress, _Board(say, orders))
         kept = "result" in answer and _highest_memory_kib() < LARGEST_KEPT_KIB
-        answers.write(json.dumps(answer | {"kept": kept}) + "\n")
+        say(answer | {"kept": kept})
     answers.close()
     flush_traces()  # after the answer, which no collector that is away may hold up
     os._exit(0)  # the thread that listens would be in the way of an orderly end
@@ -98,7 +128,7 @@ def _highest_memory_kib() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+def _answer(order: dict[str, Any], progress: Progress, board: _Board) -> dict[str, Any]:
     from threadpoolctl import threadpool_limits
 
     from app.blobs import open_blob_store
@@ -107,7 +137,9 @@ def _answer(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
         builder = load_builder(order["builder"])
         with threadpool_limits(1):
             blobs = open_blob_store(order["blob_url"], make=False)
-            return {"result": builder.fit_build(order["plan"], blobs, progress)}
+            if "chunk" in order:
+                return {"result": builder.fit_chunk(**order["chunk"], blobs=blobs, progress=progress)}
+            return {"result": builder.fit_build(order["plan"], blobs, progress, board)}
     except Unavailable as error:
         logging.getLogger(__name__).warning("%s: %s", error, error.__cause__)
         return {"unavailable": str(error)}

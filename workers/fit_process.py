@@ -11,13 +11,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import IO, Any
 
 from app.errors import Unavailable
+from app.jobs.tile_chunks import ChunkBoard
 from app.telemetry.facts import facts
 from app.telemetry.tracing import traceparent
-from workers.builder import Plan, Result
+from workers.builder import Result
 
 __all__ = ["FitFailed", "FitProcessDied", "FitProcesses"]
 
@@ -42,26 +44,40 @@ class FitProcesses:
 
     def __init__(self) -> None:
         self._idle: list[subprocess.Popen[bytes]] = []
+        self._running = 0
         self._lock = threading.Lock()
 
-    def run(
-        self, builder: str, plan: Plan, blob_url: str, report: Progress, silence_s: float = MAX_SILENCE_S
-    ) -> Result:
-        """Run `fit_build` of the module `builder` in a child process and return its result.
+    @property
+    def running(self) -> int:
+        """How many fits run at this moment."""
+        return self._running
 
-        `report` is called from this thread with the last progress, also while the fit is silent; what it raises stops
-        the child. A fit that makes no progress for `silence_s` counts as dead. Raises FitFailed, FitProcessDied, and
-        Unavailable where the child could not reach its blobs.
+    def run(
+        self,
+        builder: str,
+        work: Mapping[str, Any],
+        blob_url: str,
+        report: Progress,
+        board: ChunkBoard | None = None,
+        silence_s: float = MAX_SILENCE_S,
+    ) -> Result:
+        """Run the module `builder` in a child process and return its result: `fit_build` where `work` has a `plan`,
+
+        `fit_chunk` where it has a `chunk`. `report` is called from this thread with the last progress, also while the
+        fit is silent; what it raises stops the child. A fit that makes no progress for `silence_s` counts as dead.
+        `board`: where the fit may offer its tiles to others. Raises FitFailed, FitProcessDied, and Unavailable where
+        the child could not reach its blobs.
         """
-        order = {"builder": builder, "plan": plan, "blob_url": blob_url, "facts": dict(facts()), "trace": traceparent()}
-        child = self._take()
-        try:
-            _tell(child, json.dumps(order))
-            said = _listen(child, report, silence_s)
-        except BaseException:
-            _stop(child)
-            raise
-        self._put_back(child, said["kept"])
+        order = {"builder": builder, **work, "blob_url": blob_url, "facts": dict(facts()), "trace": traceparent()}
+        with self._counted():
+            child = self._take()
+            try:
+                _tell(child, json.dumps(order))
+                said = _listen(child, report, board, silence_s)
+            except BaseException:
+                _stop(child)
+                raise
+            self._put_back(child, said["kept"])
         result: Result = said["result"]
         return result
 
@@ -69,6 +85,16 @@ class FitProcesses:
         """End the children that wait."""
         while (child := self._pop()) is not None:
             _end(child)
+
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        with self._lock:
+            self._running += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._running -= 1
 
     def _take(self) -> subprocess.Popen[bytes]:
         while (child := self._pop()) is not None:
@@ -95,26 +121,71 @@ class FitProcesses:
             return self._idle.pop() if self._idle else None
 
 
-def _listen(child: subprocess.Popen[bytes], report: Progress, silence_s: float) -> dict[str, Any]:
+def _listen(
+    child: subprocess.Popen[bytes], report: Progress, board: ChunkBoard | None, silence_s: float
+) -> dict[str, Any]:
     """What the child said last: its result."""
     fraction, message, heard = 0.0, "starting", time.monotonic()
-    for line in _lines_or_pauses(child):
-        if line is None:
-            report(fraction, message)
-            if time.monotonic() - heard > silence_s:
-                raise FitProcessDied(f"the fit made no progress for {silence_s:,.0f} s and was stopped")
-            continue
-        heard = time.monotonic()
-        said: dict[str, Any] = json.loads(line)
-        if "result" in said:
-            return said
-        if "unavailable" in said:
-            raise Unavailable(said["unavailable"])
-        if "error" in said:
-            raise FitFailed(said["error"])
-        fraction, message = said["fraction"], said["message"]
-        report(fraction, message)
+    offered = _Offered(child, board)
+    try:
+        for line in _lines_or_pauses(child):
+            offered.tell_who_took()
+            if line is None:
+                report(fraction, message)
+                if time.monotonic() - heard > silence_s:
+                    raise FitProcessDied(f"the fit made no progress for {silence_s:,.0f} s and was stopped")
+                continue
+            heard = time.monotonic()
+            said: dict[str, Any] = json.loads(line)
+            if "result" in said:
+                return said
+            if "unavailable" in said:
+                raise Unavailable(said["unavailable"])
+            if "error" in said:
+                raise FitFailed(said["error"])
+            if "fraction" in said:
+                fraction, message = said["fraction"], said["message"]
+                report(fraction, message)
+            else:
+                offered.hear(said)
+    finally:
+        offered.withdraw()
     raise FitProcessDied(_epitaph(child))
+
+
+class _Offered:
+    """Between a child that shares its tiles and the board they are on."""
+
+    def __init__(self, child: subprocess.Popen[bytes], board: ChunkBoard | None) -> None:
+        self._child, self._board = child, board
+        self._order_sha256: str | None = None
+        self._told: Mapping[int, str | None] = {}
+        self._next_look_s = 0.0
+
+    def hear(self, said: dict[str, Any]) -> None:
+        if self._board is None:
+            return
+        if "offer" in said:
+            self._order_sha256, self._told = said["offer"]["order_sha256"], {}
+            self._board.offer(**said["offer"])
+        elif "begin" in said:
+            self._board.begin(said["begin"])
+        elif "withdraw" in said:
+            self.withdraw()
+
+    def tell_who_took(self) -> None:
+        if self._board is None or self._order_sha256 is None or time.monotonic() < self._next_look_s:
+            return
+        self._next_look_s = time.monotonic() + LOOK_EVERY_S
+        taken = self._board.taken()
+        if taken != self._told:
+            self._told = taken
+            _tell(self._child, json.dumps({"order_sha256": self._order_sha256, "taken": list(taken.items())}))
+
+    def withdraw(self) -> None:
+        if self._board is not None and self._order_sha256 is not None:
+            self._order_sha256 = None
+            self._board.withdraw()
 
 
 def _lines_or_pauses(child: subprocess.Popen[bytes]) -> Iterator[bytes | None]:

@@ -26,6 +26,7 @@ from app.jobs.lease import Lease
 from app.jobs.queue import JobQueue
 from app.settings import Settings
 from workers.builder import DEFAULT_BUILDER, load_builder
+from workers.helper import Helper
 from workers.lifeline import Lifeline, new_worker_id
 from workers.reaper import IDLE_POLL_S, Reaper
 from workers.reconcile import has_unfinished_jobs
@@ -71,6 +72,7 @@ def run_worker(
     _start_thread("fence", _end_when_lost, lease)
     _launch(engine, lease.worker_id, settings.worker_processes)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
+    _start_thread("helper", Helper(context, lease.worker_id, settings.worker_processes).run, stop)
     upkeep = Upkeep(client, context.sessions, settings.job_history_days, settings.track_history_days)
     _start_thread("upkeep", upkeep.run, stop)
     parent_died = _wait(stop, parent_pid)

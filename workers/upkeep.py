@@ -1,4 +1,5 @@
-"""Keeps tables from growing for ever: the engine's finished entries, old idempotency keys and, where asked, old tracks.
+"""Keeps tables from growing for ever: the engine's finished entries, old idempotency keys, what ended
+jobs offered to share and, where asked, old tracks.
 
 In small batches, so that nobody waits for them; running it twice at once does no harm. What has not ended is never
 touched, and no name is used twice for want of an old entry: generations only grow, and ids of maps are unique. Rows of
@@ -16,6 +17,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Idempotency, Job, Track, TrackState, TrackSteps
 from app.jobs.queue import FINAL_STATES
+from app.jobs.tile_chunks import delete_stale_chunks
 
 __all__ = ["Upkeep"]
 
@@ -49,7 +51,7 @@ class Upkeep:
 
     def clean(self) -> int:
         """One batch of each kind: how many were deleted."""
-        deleted = self._clean_engine() + self._clean_idempotency()
+        deleted = self._clean_engine() + self._clean_idempotency() + self._clean_chunks()
         return deleted + (self._clean_tracks(self.track_history_days) if self.track_history_days is not None else 0)
 
     def _clean_engine(self) -> int:
@@ -79,6 +81,10 @@ class Upkeep:
             if old:
                 session.execute(delete(Idempotency).where(tuple_(*key).in_([tuple(row) for row in old])))
         return len(old)
+
+    def _clean_chunks(self) -> int:
+        with self.sessions.begin() as session:
+            return delete_stale_chunks(session)
 
     def _clean_tracks(self, days: float) -> int:
         with self.sessions.begin() as session:

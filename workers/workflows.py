@@ -23,6 +23,7 @@ from app.db.tables import BUILD, REBUILD, Job
 from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, JobQueue, claim_generation, lock_floor
+from app.jobs.tile_chunks import ChunkBoard
 from app.telemetry.facts import add_facts, with_facts
 from app.telemetry.metrics import JOB_STEP_SECONDS, JOBS_ENDED
 from app.telemetry.tracing import link_to
@@ -144,7 +145,8 @@ class _Steps:
         return self._run_fit(plan, reporter)
 
     def _run_fit(self, plan: Plan, reporter: JobReporter) -> Result:
-        return self._context.fits.run(self._context.builder_name, plan, self._context.blob_url, reporter.report)
+        context, board = self._context, ChunkBoard(self._context.sessions, reporter.job_id)
+        return context.fits.run(context.builder_name, {"plan": plan}, context.blob_url, reporter.report, board)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)

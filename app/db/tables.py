@@ -1,4 +1,5 @@
-"""The tables: organisation, key, audit, building, floor, calibration, survey, map, job, track; worker and idempotency.
+"""The tables: organisation, key, audit, building, floor, calibration, survey, map, job, track; worker, tile chunk
+and idempotency.
 
 Ids are UUIDv7 strings, so they sort by creation. Times are UTC. Every row that a key may reach carries its
 organisation. `migrations/` holds the same schema as history; a test compares the two.
@@ -38,6 +39,7 @@ __all__ = [
     "Organisation",
     "REBUILD",
     "Survey",
+    "TileChunk",
     "Track",
     "TrackState",
     "TrackSteps",
@@ -353,6 +355,19 @@ class Worker(Base):
     beat: Mapped[datetime]
     reaper: Mapped[str | None] = mapped_column(String(120))
     slots: Mapped[int | None]
+
+
+class TileChunk(Base):
+    """Some tiles of a floor whose fit workers share (docs/decisions/0017). `order_sha256` says what to fit, for
+    programs of this `version`; `taken_by` is a worker or the fit's own, `fits_sha256` what was brought."""
+
+    __tablename__ = "tile_chunk"
+    job_id: Mapped[str] = mapped_column(Id, primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    order_sha256: Mapped[str] = mapped_column(Sha256)
+    version: Mapped[str] = mapped_column(String(40))
+    taken_by: Mapped[str | None] = mapped_column(String(120))
+    fits_sha256: Mapped[str | None] = mapped_column(Sha256)
 
 
 class Idempotency(Base):

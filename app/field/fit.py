@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -27,18 +28,14 @@ from app.field.refinement import Untouched, refine
 from app.field.samples import COMPONENT_NAMES, Samples
 from app.field.spec import Engine, FittedMap, MapSpec, Progress
 from app.field.tally import held_out_errors
-from app.field.tile_fit import FitState
+from app.field.tile_fit import FitState, FitTiles, fit_one_by_one
 from app.field.walk_localizability import add_localizability
 from app.geometry import Array
 
 __all__ = ["fit_map"]
 
 _Estimator = Callable[[Sequence[Walk], Cleaned, MapSpec, FitState | None, Progress], FieldEstimate]
-_ENGINES: dict[Engine, _Estimator] = {
-    "hilbert": estimate_by_hilbert,
-    "exact": estimate_by_exact,
-    "compromise": estimate_by_compromise,
-}
+_WITHOUT_TILES: dict[Engine, _Estimator] = {"exact": estimate_by_exact, "compromise": estimate_by_compromise}
 
 
 RELEARN = 2.0
@@ -52,7 +49,11 @@ def _silent(fraction: float, message: str) -> None:
 
 
 def fit_map(
-    walks: Mapping[str, Samples], spec: MapSpec, progress: Progress = _silent, previous: FitState | None = None
+    walks: Mapping[str, Samples],
+    spec: MapSpec,
+    progress: Progress = _silent,
+    previous: FitState | None = None,
+    fit_tiles: FitTiles = fit_one_by_one,
 ) -> FittedMap:
     """Fit a map from the walks of its surveys (survey id -> samples); the order of the mapping does not matter.
 
@@ -62,6 +63,7 @@ def fit_map(
     have changed are fitted again, and the map is what a fit of everything with the same hyper-parameters gives. An id
     must stand for the same samples in both. A map of refined walks is fitted from nothing, and leaves no state: a walk
     more moves all the others.
+    `fit_tiles` fits the tiles of engine hilbert, here or elsewhere.
     `progress(fraction, message)` is called often; what it raises (JobCancelled) passes through.
     Raises InvalidInput when there is too little to fit or the parameters make no map, IncompatibleFrames when a walk
     cannot give `spec.components`.
@@ -80,7 +82,8 @@ def fit_map(
     if applied is not None:
         cleaned = replace(cleaned, walks=applied.walks)
     observed = observe(cleaned.walks, spec.components)
-    estimate = _ENGINES[spec.engine](
+    estimator = _WITHOUT_TILES.get(spec.engine) or partial(estimate_by_hilbert, fit_tiles=fit_tiles)
+    estimate = estimator(
         observed, cleaned, spec, previous, lambda f, text: progress(refining + (0.9 - refining) * f, text)
     )
     progress(0.9, "scoring the map by leaving each survey out")

@@ -23,7 +23,7 @@ from app.field.potential import blend_potentials
 from app.field.raster import Blended, GridFrame, blend, layer_heights_m, on_all_layers, reach_up_m, reachable
 from app.field.spec import MapSpec, Progress
 from app.field.survey_noise import clearly_differ, survey_noise_scales
-from app.field.tile_fit import FitState, Learned, TileFit, fit_tile
+from app.field.tile_fit import FitState, FitTiles, Learned, TileFit, TileOrder, fit_one_by_one
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Heights, Lattice, Slab, Tile
 from app.geometry import Array
@@ -53,7 +53,12 @@ class _Fit(NamedTuple):
 
 
 def estimate_by_hilbert(
-    walks: Sequence[Walk], cleaned: Cleaned, spec: MapSpec, previous: FitState | None, progress: Progress
+    walks: Sequence[Walk],
+    cleaned: Cleaned,
+    spec: MapSpec,
+    previous: FitState | None,
+    progress: Progress,
+    fit_tiles: FitTiles = fit_one_by_one,
 ) -> FieldEstimate:
     """The blended field of all tiles, and the walks predicted by subtraction. Raises InvalidInput for a huge grid."""
     layers_m = layer_heights_m(walks, spec)
@@ -69,7 +74,7 @@ def estimate_by_hilbert(
         return _with_offsets(learned, cleaned.offset_variance_uT2)
 
     def fitted(learned: Learned, kept: Mapping[Tile, TileFit]) -> _Fit:
-        return _fit_tiles(walks, learned, spec, layers_m, kept, lambda f, text: progress(0.4 + 0.6 * f, text))
+        return _fitted(walks, learned, spec, layers_m, kept, fit_tiles, lambda f, text: progress(0.4 + 0.6 * f, text))
 
     if previous is not None:
         before = _with_offsets(previous.learned, cleaned.offset_variance_uT2)
@@ -87,27 +92,26 @@ def estimate_by_hilbert(
     return _estimate(fit, walks, cleaned, spec, layers_m, previous is not None, old)
 
 
-def _fit_tiles(
+def _fitted(
     walks: Sequence[Walk],
     learned: Learned,
     spec: MapSpec,
     layers_m: Array,
     kept: Mapping[Tile, TileFit],
+    fit_tiles: FitTiles,
     progress: Progress,
 ) -> _Fit:
-    """One tile after the other; those of `kept` that the same surveys cross are taken as they are."""
+    """Every tile, in order; those of `kept` that the same surveys cross are taken as they are."""
     frame = GridFrame.around(walks, spec.resolution_m, learned.hyper.length_m, layers_m)
     coarse_ratio = interpolation_ratio(learned.hyper.finest_length_m, spec.resolution_m)
     answered = _answered(walks, spec, layers_m)
     tiled = TiledWalks(learned.lattice, walks, learned.ambient_uT)
-    tiles: dict[Tile, TileFit] = {}
-    count = len(tiled.counts())
-    for index, tile in enumerate(tiled.counts()):
-        fit = kept.get(tile)
-        if fit is None or fit.surveys != tiled.crossing(tile):
-            progress(index / count, f"fitting tile {index + 1} of {count}")
-            fit = fit_tile(tiled, tile, learned, spec.resolution_m, layers_m[answered], spec.robust)
-        tiles[tile] = fit
+    wanted = list(tiled.counts())
+    fits = {tile: kept[tile] for tile in wanted if tile in kept and kept[tile].surveys == tiled.crossing(tile)}
+    missing = [tile for tile in wanted if tile not in fits]
+    order = TileOrder(tiled, learned, spec.resolution_m, layers_m[answered], spec.robust, missing)
+    fits.update(fit_tiles(order, progress))
+    tiles = {tile: fits[tile] for tile in wanted}
     predicted = HeldOutPrediction(learned.lattice, walks, len(next(iter(tiles.values())).patch.variance_ratio))
     for tile, fit in tiles.items():
         predicted.add(tile, tiled.all_answered(tile), fit.held_out)

@@ -4,7 +4,7 @@ It depends on the hyper-parameters and on what the surveys that cross the tile m
 long as those are the same surveys the fit is the same, bit for bit, and need not be made again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,12 +15,13 @@ from app.field.hilbert import Patch, SlabPosterior, posterior, predict
 from app.field.hyperparameters import Hyperparameters
 from app.field.raster import tile_cells
 from app.field.robust import student_evidence
+from app.field.spec import Progress
 from app.field.statistics import Evidence, add_evidence
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Lattice, Tile
 from app.geometry import Array
 
-__all__ = ["FitState", "HeldOutPart", "Learned", "TileFit", "fit_tile"]
+__all__ = ["FitState", "FitTiles", "HeldOutPart", "Learned", "TileFit", "TileOrder", "fit_one_by_one", "fit_tile"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +69,36 @@ class FitState:
     heights_m: Array
     hard_iron: HardIron
     tiles: Mapping[Tile, TileFit]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileOrder:
+    """Tiles to be fitted, with what all of them need: walks cut up by the lattice of `learned`, the raster's cell, its
+
+    heights (nz,), and whether outliers are weighted down.
+    """
+
+    walks: TiledWalks
+    learned: Learned
+    resolution_m: float
+    heights_m: Array
+    robust: bool
+    tiles: Sequence[Tile]
+
+    def fit(self, tile: Tile) -> TileFit:
+        """The fit of one of the tiles, the same wherever and whenever it is made."""
+        return fit_tile(self.walks, tile, self.learned, self.resolution_m, self.heights_m, self.robust)
+
+
+FitTiles = Callable[[TileOrder, Progress], Iterable[tuple[Tile, TileFit]]]
+"""Fits the tiles of an order, each once and in any order."""
+
+
+def fit_one_by_one(order: TileOrder, progress: Progress) -> Iterable[tuple[Tile, TileFit]]:
+    """The tiles of an order, one after the other, here."""
+    for index, tile in enumerate(order.tiles):
+        progress(index / len(order.tiles), f"fitting tile {index + 1:,} of {len(order.tiles):,}")
+        yield tile, order.fit(tile)
 
 
 def fit_tile(

@@ -30,6 +30,7 @@ class TiledWalks:
 
     def __init__(self, lattice: Lattice, walks: Sequence[Walk], ambient_uT: Array) -> None:
         self.lattice = lattice
+        self.walks = walks
         self._survey_ids = [walk.survey_id for walk in walks]
         self._owner = np.repeat(np.arange(len(walks)), [len(walk) for walk in walks])
         self.points_m = np.concatenate([walk.position_m for walk in walks])

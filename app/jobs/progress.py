@@ -28,7 +28,7 @@ class JobReporter:
     ) -> None:
         """`still_owner(progress)` raises when the job has been given to another worker. Reports closer together than
         `interval_s` are dropped, so a chatty fit costs at most two small transactions a second."""
-        self._sessions, self._job_id, self._still_owner = sessions, job_id, still_owner
+        self._sessions, self.job_id, self._still_owner = sessions, job_id, still_owner
         self._interval_s, self._next_s = interval_s, 0.0
 
     def report(self, fraction: float, message: str) -> None:
@@ -39,7 +39,7 @@ class JobReporter:
         self._still_owner(progress)
         statement = (
             update(Job)
-            .where(Job.id == self._job_id, Job.status == "running")
+            .where(Job.id == self.job_id, Job.status == "running")
             .values(progress=progress, message=message)
             .returning(Job.cancel_requested)
         )
@@ -47,7 +47,7 @@ class JobReporter:
             with self._sessions.begin() as session:
                 cancelled = session.scalar(statement)
         except DBAPIError:  # hours of work must not end because a report could not be written
-            log.warning("progress of job %s could not be written", self._job_id, exc_info=True)
+            log.warning("progress of job %s could not be written", self.job_id, exc_info=True)
             cancelled = False
         if cancelled is not False:
             raise JobCancelled("the job was asked to stop")

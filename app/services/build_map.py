@@ -20,13 +20,14 @@ from app.errors import CorruptArtefact, InvalidInput, NotFound
 from app.field.fit import fit_map
 from app.field.samples import SampleFrame, Samples, richest_components
 from app.field.spec import FittedMap, MapSpec
-from app.field.tile_fit import FitState
+from app.field.tile_fit import FitState, fit_one_by_one
 from app.services.artefacts import grid_to_bytes, layers_to_bytes, samples_from_bytes
 from app.services.disturbances import against_others, without_stretches
 from app.services.exact_limit import TOO_MANY, outgrow_exact
 from app.services.fit_state import Excluded, state_from_bytes, state_to_bytes
+from app.services.shared_tiles import Board, fit_chunk, fit_with_others
 
-__all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "publish_build"]
+__all__ = ["claim_build", "dismiss_build", "fail_build", "fit_build", "fit_chunk", "publish_build"]
 
 Plan = dict[str, Any]
 Result = dict[str, Any]
@@ -93,8 +94,12 @@ def _earlier_states(session: Session, job: Job, map_row: Map) -> Plan:
     return {"previous": previous if continued else None, "stale_states": stale}
 
 
-def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None]) -> Result:
+def fit_build(
+    plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None], board: Board | None = None
+) -> Result:
     """Fit the map of a plan and store its grid, layers and quality reports as blobs. No database; may take minutes.
+
+    Where there is a `board` others may help with the tiles of a large floor, by `fit_chunk`.
 
     A rebuild of what has outgrown engine `exact` is by the default engine; a build that was asked for is as asked.
     Raises InvalidInput (nothing to fit, frames that cannot give the components asked for), JobCancelled (through
@@ -116,7 +121,11 @@ def fit_build(plan: Plan, blobs: BlobStore, progress: Callable[[float, str], Non
         parameters["heights_m"] = tuple(parameters["heights_m"])
     previous = _previous_state(plan, parameters["components"], blobs)
     fitted = fit_map(
-        walks, MapSpec(**parameters), lambda f, message: progress(0.02 + 0.93 * f, message), previous=previous
+        walks,
+        MapSpec(**parameters),
+        lambda f, message: progress(0.02 + 0.93 * f, message),
+        previous=previous,
+        fit_tiles=fit_with_others(board, blobs) if board else fit_one_by_one,
     )
     progress(0.96, "storing the grid")
     for sha256 in plan.get("stale_states", []):

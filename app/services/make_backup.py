@@ -17,14 +17,14 @@ from app.blobs import BlobStore
 from app.db.engine import migration_state
 from app.db.portable_rows import columns_of, row_as_line, rows_of
 from app.db.snapshot import snapshot
-from app.db.tables import Base, Worker
+from app.db.tables import Base, TileChunk, Worker
 from app.errors import Conflict, CorruptArtefact, NotFound
 from app.services.backup_archive import ArchiveWriter, Manifest, Progress, StoredTable
 from app.services.references import References, references
 
 __all__ = ["LEFT_OUT", "Backup", "make_backup"]
 
-LEFT_OUT = frozenset({Worker.__tablename__})
+LEFT_OUT = frozenset({Worker.__tablename__, TileChunk.__tablename__})
 """Tables that are of the running processes alone: the leases of workers."""
 
 

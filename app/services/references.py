@@ -11,10 +11,10 @@ from typing import Any
 from sqlalchemy import Connection, select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from app.db.tables import Calibration, Floor, Map, Survey, Track
+from app.db.tables import Calibration, Floor, Map, Survey, TileChunk, Track
 from app.jobs.queue import JobQueue
 
-__all__ = ["CACHES", "IN_JSON", "NAMING", "References", "carried_by_jobs", "references"]
+__all__ = ["CACHES", "IN_HAND", "IN_JSON", "NAMING", "References", "carried_by_jobs", "references"]
 
 NAMING: tuple[InstrumentedAttribute[Any], ...] = (
     Survey.raw_sha256,
@@ -28,6 +28,9 @@ NAMING: tuple[InstrumentedAttribute[Any], ...] = (
 
 CACHES: tuple[InstrumentedAttribute[Any], ...] = (Map.state_sha256,)
 """Columns that name a blob which saves work: without it the next build is a full one."""
+
+IN_HAND: tuple[InstrumentedAttribute[Any], ...] = (TileChunk.order_sha256, TileChunk.fits_sha256)
+"""Columns that name what workers tell each other while a job runs."""
 
 IN_JSON: Mapping[InstrumentedAttribute[Any], Callable[[Any], list[str]]] = {
     Floor.plan: lambda plan: [plan["sha256"]],
@@ -68,7 +71,8 @@ def references(session: Session | Connection) -> References:
 
 def carried_by_jobs(session: Session, queue: JobQueue) -> frozenset[str]:
     """Blobs that unfinished jobs hold in what the job engine keeps of them: read by a fit, or not yet published."""
-    return frozenset(found for said in queue.recorded(session) for found in _hashes(said))
+    recorded = frozenset(found for said in queue.recorded(session) for found in _hashes(said))
+    return recorded.union(*(_plain(session, column) for column in IN_HAND))
 
 
 def _name(column: InstrumentedAttribute[Any]) -> str:

@@ -2,7 +2,8 @@
 
 What a fit does is said by the map's spec or, for rebuilds, by the floor's name: a JSON object with `sleep_s`, `fail`,
 `die_times`, `silent`; `claim_s` holds the floor locked that long, `hold_s` keeps the fit's interpreter busy and lets no
-other thread in, `kill_worker` takes the worker down with the fit.
+other thread in, `kill_worker` takes the worker down with the fit. `chunks` are offered to other workers for as long as
+`sleep_s`, or until all are brought; each takes them `chunk_s`, or `kill_helper` takes the worker down that took it.
 """
 
 import json
@@ -20,6 +21,7 @@ from sqlalchemy.orm import Session
 from app.blobs import BlobStore
 from app.db.tables import Floor, Job, Map, Survey
 from app.errors import InvalidInput
+from app.services.shared_tiles import Board
 
 DIARY = Path(os.environ["ISODYN_TEST_DIARY"])
 
@@ -61,7 +63,9 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
     return {"map_id": row.id, "floor_id": floor.id, "sequence": row.sequence, "surveys": row.survey_ids, **orders}
 
 
-def fit_build(plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None]) -> dict[str, Any]:
+def fit_build(
+    plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None], board: Board
+) -> dict[str, Any]:
     note("fit starts", floor_id=plan["floor_id"], map_id=plan["map_id"], surveys=plan["surveys"])
     if plan.get("fail"):
         raise InvalidInput("the walks do not overlap; walk the floor again")
@@ -76,14 +80,42 @@ def fit_build(plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float,
     began = time.monotonic()
     while time.monotonic() - began < plan.get("hold_s", 0.0):
         sum(range(50_000_000))  # a second or so in compiled code that never lets go of the interpreter
-    slices = max(1, round(plan.get("sleep_s", 0.2) / 0.05))
+    slices, chunks = max(1, round(plan.get("sleep_s", 0.2) / 0.05)), plan.get("chunks", 0)
+    if chunks:
+        board.offer(blobs.put(json.dumps(plan).encode()), chunks)
     for n in range(slices):
+        if chunks and _all_brought(plan, board):
+            break
         if not plan.get("silent"):
             progress(n / slices, f"slice {n} of {slices}")
         time.sleep(0.05)
+    if chunks:
+        brought = {number: blobs.get(sha256).decode() for number, sha256 in board.taken().items() if sha256}
+        note("brought", floor_id=plan["floor_id"], brought=brought, taken=sorted(board.taken()))
+        board.withdraw()
     sha256 = blobs.put(json.dumps(sorted(plan["surveys"])).encode())
     note("fit ends", floor_id=plan["floor_id"], map_id=plan["map_id"])
     return {"sha256": sha256}
+
+
+def _all_brought(plan: dict[str, Any], board: Board) -> bool:
+    """Or nothing is to be waited for any more."""
+    if plan.get("kill_helper"):
+        return '"chunk starts"' in DIARY.read_text().split(plan["map_id"])[-1]
+    return sum(sha256 is not None for sha256 in board.taken().values()) == plan["chunks"]
+
+
+def fit_chunk(
+    order_sha256: str, number: int, blobs: BlobStore, progress: Callable[[float, str], None]
+) -> dict[str, Any]:
+    plan = json.loads(blobs.get(order_sha256))
+    note("chunk starts", floor_id=plan["floor_id"], number=number, worker=os.getppid())
+    if plan.get("kill_helper"):
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(60)
+    time.sleep(plan.get("chunk_s", 0.0))
+    progress(1.0, "done")
+    return {"fits_sha256": blobs.put(f"chunk {number}".encode())}
 
 
 def publish_build(session: Session, job_id: str, plan: dict[str, Any], result: dict[str, Any]) -> None:

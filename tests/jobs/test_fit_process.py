@@ -33,7 +33,7 @@ def test_a_child_that_did_well_is_kept_for_the_next_fit_and_another_is_not(tmp_p
     large = np.ones(2**27)  # 1 GiB of ours is not the child's
     for orders in ({}, {}, {"fail": True}, {}):
         with nullcontext() if not orders else pytest.raises(FitFailed, match="walk the floor again"):
-            fits.run("tests.jobs.fake_builder", plan | orders, blobs, quiet)
+            fits.run("tests.jobs.fake_builder", {"plan": plan | orders}, blobs, quiet)
     fits.close()
     del large
     diary = (tmp_path / "diary").read_text().splitlines()
@@ -48,9 +48,9 @@ def test_a_fit_says_nothing_of_the_fit_before_it(blobs: str, capfd: pytest.Captu
     fits = FitProcesses()
     plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
     with with_facts(request_id="the-first", job_id="1"):
-        fits.run("tests.jobs.fake_builder", plan, blobs, quiet)
+        fits.run("tests.jobs.fake_builder", {"plan": plan}, blobs, quiet)
     with with_facts(job_id="2"), pytest.raises(FitFailed, match="ZeroDivisionError"):
-        fits.run("tests.jobs.fake_builder", plan | {"break": True}, blobs, quiet)
+        fits.run("tests.jobs.fake_builder", {"plan": plan | {"break": True}}, blobs, quiet)
     log = capfd.readouterr().err
     assert "job_id=2" in log
     assert "the-first" not in log
@@ -60,11 +60,11 @@ def test_a_fit_does_not_make_the_blob_folder_whose_disk_is_away(tmp_path: Path, 
     plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
     (tmp_path / "blobs").rename(tmp_path / "away")
     with pytest.raises(Unavailable, match="is its disk mounted"):
-        FitProcesses().run("tests.jobs.fake_builder", plan, blobs, quiet)
+        FitProcesses().run("tests.jobs.fake_builder", {"plan": plan}, blobs, quiet)
     assert not (tmp_path / "blobs").exists()
 
 
 def test_a_fit_that_makes_no_progress_is_stopped(blobs: str) -> None:
     plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 60.0, "silent": True}
     with pytest.raises(FitProcessDied, match="no progress"):
-        FitProcesses().run("tests.jobs.fake_builder", plan, blobs, quiet, silence_s=1.0)
+        FitProcesses().run("tests.jobs.fake_builder", {"plan": plan}, blobs, quiet, silence_s=1.0)

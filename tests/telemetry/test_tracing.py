@@ -156,7 +156,7 @@ def test_a_collector_that_is_slow_does_not_hold_up_a_fit(
     collector.may_answer.clear()
     fits = FitProcesses()
     plan = {"floor_id": "f", "map_id": "m", "surveys": [], "sleep_s": 0.05}
-    assert fits.run("tests.jobs.fake_builder", plan, blobs, lambda _fraction, _message: None)
+    assert fits.run("tests.jobs.fake_builder", {"plan": plan}, blobs, lambda _fraction, _message: None)
     collector.may_answer.set()
     collector.wait_for("isodyn-fit", "blob put")
     fits.close()
