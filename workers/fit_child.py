@@ -100,7 +100,10 @@ def main() -> None:
     orders = _Orders()
 
     def say(answer: dict[str, Any]) -> None:
-        answers.write(json.dumps(answer) + "\n")
+        try:
+            answers.write(json.dumps(answer) + "\n")
+        except BrokenPipeError:
+            os._exit(ORPHANED)
 
     def progress(fraction: float, message: str) -> None:
         if orders.cancelled.is_set():

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session, sessionmaker
 from app import __version__
 from app.db.tables import Job, TileChunk
 
-__all__ = ["Chunk", "ChunkBoard", "bring_chunk", "delete_stale_chunks", "take_chunk"]
+__all__ = ["BUILDER", "Chunk", "ChunkBoard", "bring_chunk", "delete_stale_chunks", "take_chunk"]
 
 BUILDER = "builder"
 """Who takes what the worker that builds the map fits itself."""
@@ -39,19 +39,13 @@ class ChunkBoard:
         self._sessions, self._job_id = sessions, job_id
 
     def offer(self, order_sha256: str, chunks: int) -> None:
-        """Let workers of this version take chunks 0 to `chunks` - 1 of this order, and of no other of the job.
-
-        What was brought to a worker that died over the same order still serves.
-        """
+        """Let workers of this version take chunks 0 to `chunks` - 1 of this order, and of no other of the job."""
 
         def change(session: Session) -> None:
-            mine = TileChunk.job_id == self._job_id
-            session.execute(delete(TileChunk).where(mine, TileChunk.order_sha256 != order_sha256))
-            there = set(session.scalars(select(TileChunk.number).where(mine)))
+            session.execute(delete(TileChunk).where(TileChunk.job_id == self._job_id))
             session.add_all(
                 TileChunk(job_id=self._job_id, number=number, order_sha256=order_sha256, version=__version__)
                 for number in range(chunks)
-                if number not in there
             )
 
         self._attempt(change, None)

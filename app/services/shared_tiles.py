@@ -5,7 +5,8 @@ end while it goes on from the beginning, and never waits for them: what they hav
 it fits itself. A fit of a tile is the same wherever it is made, so neither is the map any other.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import Protocol
@@ -17,22 +18,24 @@ from app.errors import CorruptArtefact, NotFound, Unavailable
 from app.field.hard_iron import HardIron
 from app.field.observations import Walk
 from app.field.spec import Progress
-from app.field.tile_fit import FitState, FitTiles, TileFit, TileOrder, fit_one_by_one
+from app.field.tile_fit import FitState, FitTiles, TileFit, TileOrder
 from app.field.tiled_walks import TiledWalks
 from app.field.tiles import Tile
 from app.services.artefacts import pack, unpack
 from app.services.fit_state import state_from_bytes, state_to_bytes
 
-__all__ = ["LEAST_TILES", "Board", "fit_chunk", "fit_with_others"]
+__all__ = ["Board", "fit_chunk", "fit_with_others"]
 
-LEAST_TILES = 768
-"""Fewer are fitted in two or three seconds, before anybody else has begun."""
-CHUNK_TILES = 128
+ALONE_S = 1.0
+"""So long one fits alone, to see how long the tiles take: one to sixty milliseconds each, by what they are."""
+LEAST_LEFT_S = 3.0
+"""Less than that is done before anybody else has begun."""
+CHUNK_S = 0.5
 _OF_WALKS = ("position_m", "field_uT", "path_m")
 _NO_SAMPLES = {"scatter_uT2": np.zeros(0), "sample_field_uT": np.zeros((0, 0)), "stretch_of_sample": np.zeros(0, int)}
 """Tiles are fitted from observations alone."""
 
-_last_order: dict[str, TileOrder] = {}
+_last_order: dict[str, tuple[TileOrder, list[list[Tile]]]] = {}
 
 
 class Board(Protocol):
@@ -56,15 +59,23 @@ class Board(Protocol):
 
 
 def fit_with_others(board: Board, blobs: BlobStore) -> FitTiles:
-    """Fits the tiles of large orders together with whoever takes chunks from the board.
+    """Fits tiles together with whoever takes chunks from the board, where they take long.
 
     Raises Unavailable where the blob store is away.
     """
 
-    def fit(order: TileOrder, progress: Progress) -> Iterable[tuple[Tile, TileFit]]:
-        if len(order.tiles) < LEAST_TILES:
-            return fit_one_by_one(order, progress)
-        return _fit_together(order, board, blobs, progress)
+    def fit(order: TileOrder, progress: Progress) -> Iterator[tuple[Tile, TileFit]]:
+        count, began_s = len(order.tiles), 0.0
+        for done, tile in enumerate(order.tiles):
+            if done == 1:  # the first may have to be compiled for
+                began_s = time.monotonic()
+            alone_s = time.monotonic() - began_s
+            if done > 1 and alone_s > ALONE_S and alone_s / (done - 1) * (count - done) > LEAST_LEFT_S:
+                chunk_tiles = max(1, round(CHUNK_S * (done - 1) / alone_s))
+                yield from _fit_together(order, done, chunk_tiles, board, blobs, progress)
+                return
+            progress(done / count, f"fitting tile {done + 1:,} of {count:,}")
+            yield tile, order.fit(tile)
 
     return fit
 
@@ -77,8 +88,8 @@ def fit_chunk(order_sha256: str, number: int, blobs: BlobStore, progress: Progre
     if order_sha256 not in _last_order:  # whoever fits one chunk of an order fits more of it
         _last_order.clear()
         _last_order[order_sha256] = _order_from_bytes(blobs.get(order_sha256))
-    order = _last_order[order_sha256]
-    fits, tiles = {}, _chunks(order)[number]
+    order, chunks = _last_order[order_sha256]
+    fits, tiles = {}, chunks[number]
     for index, tile in enumerate(tiles):
         progress(index / len(tiles), f"fitting tile {index + 1:,} of {len(tiles):,} for another worker")
         fits[tile] = order.fit(tile)
@@ -86,11 +97,11 @@ def fit_chunk(order_sha256: str, number: int, blobs: BlobStore, progress: Progre
 
 
 def _fit_together(
-    order: TileOrder, board: Board, blobs: BlobStore, progress: Progress
+    order: TileOrder, done: int, chunk_tiles: int, board: Board, blobs: BlobStore, progress: Progress
 ) -> Iterator[tuple[Tile, TileFit]]:
-    """What nobody has taken first, then what others have brought, then what they have not."""
-    left = dict(enumerate(_chunks(order)))
-    order_sha256 = blobs.put(_order_to_bytes(order))
+    """The tiles after the first `done`: those nobody has taken, then what others brought, then what they did not."""
+    left = dict(enumerate(_chunks(order.tiles[done:], chunk_tiles)))
+    order_sha256 = blobs.put(_order_to_bytes(order, [*left.values()]))
     board.offer(order_sha256, len(left))
 
     def place(chunk: int) -> tuple[bool, bool, int]:
@@ -102,7 +113,6 @@ def _fit_together(
         progress(done / len(order.tiles), f"fitting tile {done + 1:,} of {len(order.tiles):,}{together}")
 
     try:
-        done = 0
         while left:
             chunk = min(left, key=place)
             board.begin(chunk)
@@ -117,7 +127,7 @@ def _fit_together(
                 fits[tile] = order.fit(tile)
             yield from fits.items()
             done += len(left.pop(chunk))
-    finally:  # of a worker that is killed they stay, for the one that takes over
+    finally:
         used = {order_sha256, *filter(None, board.taken().values())}
         board.withdraw()
         with suppress(Unavailable):
@@ -125,9 +135,8 @@ def _fit_together(
                 blobs.discard(sha256)
 
 
-def _chunks(order: TileOrder) -> list[list[Tile]]:
-    tiles = list(order.tiles)
-    return [tiles[start : start + CHUNK_TILES] for start in range(0, len(tiles), CHUNK_TILES)]
+def _chunks(tiles: Sequence[Tile], size: int) -> list[list[Tile]]:
+    return [list(tiles[start : start + size]) for start in range(0, len(tiles), size)]
 
 
 def _fits_to_bytes(order: TileOrder, fits: Mapping[Tile, TileFit]) -> bytes:
@@ -145,7 +154,7 @@ def _read_fits(sha256: str | None, tiles: list[Tile], blobs: BlobStore) -> dict[
     return fits if list(fits) == tiles else None
 
 
-def _order_to_bytes(order: TileOrder) -> bytes:
+def _order_to_bytes(order: TileOrder, chunks: list[list[Tile]]) -> bytes:
     walks = order.walks.walks
     header = {
         "kind": "tile order",
@@ -153,13 +162,13 @@ def _order_to_bytes(order: TileOrder) -> bytes:
         "observations": [len(walk) for walk in walks],
         "resolution_m": order.resolution_m,
         "robust": order.robust,
-        "tiles": [list(tile) for tile in order.tiles],
+        "chunks": [[list(tile) for tile in chunk] for chunk in chunks],
     }
     arrays = {name: np.concatenate([getattr(walk, name) for walk in walks]) for name in _OF_WALKS}
     return pack(header, {**arrays, "state": np.frombuffer(_fits_to_bytes(order, {}), np.uint8)})
 
 
-def _order_from_bytes(data: bytes) -> TileOrder:
+def _order_from_bytes(data: bytes) -> tuple[TileOrder, list[list[Tile]]]:
     header, arrays = unpack(data, "tile order")
     state = state_from_bytes(arrays["state"].tobytes(), {})
     learned, bounds = state.learned, np.cumsum([0, *header["observations"]]).tolist()
@@ -167,11 +176,13 @@ def _order_from_bytes(data: bytes) -> TileOrder:
         Walk(survey_id, **{name: arrays[name][start:stop] for name in _OF_WALKS}, **_NO_SAMPLES)
         for survey_id, (start, stop) in zip(header["surveys"], pairwise(bounds), strict=True)
     ]
-    return TileOrder(
+    chunks = [[Tile(*place) for place in chunk] for chunk in header["chunks"]]
+    order = TileOrder(
         TiledWalks(learned.lattice, walks, learned.ambient_uT),
         learned,
         header["resolution_m"],
         state.heights_m,
         header["robust"],
-        [Tile(*place) for place in header["tiles"]],
+        [tile for chunk in chunks for tile in chunk],
     )
+    return order, chunks

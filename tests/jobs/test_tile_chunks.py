@@ -60,15 +60,10 @@ def test_chunks_are_taken_from_the_end_and_brought(job_id: str, sessions: sessio
     assert not bring(sessions, chunk, "c" * 64)
 
 
-def test_the_same_order_keeps_what_was_brought_and_another_does_not(
-    job_id: str, sessions: sessionmaker[Session]
-) -> None:
+def test_a_later_order_takes_the_place_of_the_one_before(job_id: str, sessions: sessionmaker[Session]) -> None:
     board = ChunkBoard(sessions, job_id)
     board.offer(ORDER, 2)
     chunk = take(sessions)
-    bring(sessions, chunk, "c" * 64)
-    ChunkBoard(sessions, job_id).offer(ORDER, 2)
-    assert board.taken() == {1: "c" * 64}
     board.offer(LATER, 2)
     assert board.taken() == {}
     assert not bring(sessions, chunk, "c" * 64)

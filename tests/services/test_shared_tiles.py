@@ -26,8 +26,8 @@ def quiet(fraction: float, message: str) -> None:
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_tiles, "LEAST_TILES", 6)
-    monkeypatch.setattr(shared_tiles, "CHUNK_TILES", 3)
+    for name in ("ALONE_S", "LEAST_LEFT_S", "CHUNK_S"):
+        monkeypatch.setattr(shared_tiles, name, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +130,10 @@ def test_a_fit_that_is_cancelled_takes_its_offer_back(walks: dict[str, Samples],
         fit_chunk("f" * 64, 0, blob_store, quiet)
 
 
-def test_few_tiles_are_not_offered(
+def test_what_is_soon_done_is_not_offered(
     walks: dict[str, Samples], blob_store: FolderBlobStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shared_tiles, "LEAST_TILES", 100_000)
+    monkeypatch.setattr(shared_tiles, "LEAST_LEFT_S", 1000.0)
     others = Others(blob_store, brings=range(100))
     fitted(walks, SPECS["plane"], others, blob_store)
     assert others.offers == []
