@@ -7,10 +7,10 @@ What is sent at once may pass a limit of the organisation together, by as many a
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select, func, or_, select
 from sqlalchemy.orm import Session
 
-from app.db.tables import Building, Floor, Survey
+from app.db.tables import Building, Floor, Key, Survey, utc_now
 from app.errors import QuotaExceeded
 
 __all__ = ["Quotas"]
@@ -25,11 +25,23 @@ class Quotas:
     surveys: int
     surveys_per_floor: int
     survey_bytes: int
+    keys: int
 
     def check_buildings(self, session: Session, organisation_id: str) -> None:
         """Raises QuotaExceeded, as all of these."""
         there = select(func.count()).select_from(Building).where(Building.organisation_id == organisation_id)
         _within(session, there, self.buildings, "this organisation has {most} buildings, the most it may have")
+
+    def check_keys(self, session: Session, organisation_id: str) -> None:
+        """Those that have not ended. Subjects of an identity provider are its business, and not counted."""
+        lives = or_(Key.expires_at.is_(None), Key.expires_at > utc_now())
+        there = (
+            select(func.count())
+            .select_from(Key)
+            .where(Key.organisation_id == organisation_id, Key.subject.is_(None), Key.revoked_at.is_(None), lives)
+        )
+        told = "this organisation has {most} keys that have not ended, the most it may have; revoke some"
+        _within(session, there, self.keys, told)
 
     def check_floors(self, session: Session, building_id: str) -> None:
         there = select(func.count()).select_from(Floor).where(Floor.building_id == building_id)
@@ -43,13 +55,11 @@ class Quotas:
 
     def check_surveys(self, session: Session, organisation_id: str, coming: int = 0, coming_bytes: int = 0) -> None:
         """Reads the index entries of all surveys of the organisation: once an upload."""
-        there = select(func.count(), func.coalesce(func.sum(Survey.raw_bytes), 0)).where(
-            Survey.organisation_id == organisation_id
-        )
+        there = select(func.count(), func.sum(Survey.raw_bytes)).where(Survey.organisation_id == organisation_id)
         count, size = session.execute(there).one()
         if count + coming > self.surveys:
             raise _exceeded("this organisation has {most} surveys, the most it may have; delete some", self.surveys)
-        if size + coming_bytes > self.survey_bytes:
+        if (size or 0) + coming_bytes > self.survey_bytes:
             told = "the survey files of this organisation would be more than {most} bytes; delete some"
             raise _exceeded(told, self.survey_bytes)
 

@@ -20,7 +20,7 @@ from app.api.auth import recognised
 from app.api.body import BodyLimit, upload
 from app.api.context import Context
 from app.api.key_limits import KeyLimits
-from app.db.tables import Floor, Survey
+from app.db.tables import Floor, Key, Survey
 from app.errors import Overloaded, QuotaExceeded, TooMany
 from app.main import create_app, first_start
 from app.services.manage_keys import create_key
@@ -37,7 +37,7 @@ def context(database_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iter
     settings = Settings(
         data_dir=tmp_path_factory.mktemp("data"), database_url=database_url, admin_key=ADMIN, max_buildings=3,
         max_floors_per_building=2, max_surveys_per_floor=2, max_surveys=3, max_requests_per_s=50.0,
-        max_requests_per_key=5, parse_memory_bytes=2**28,
+        max_requests_per_key=5, max_keys=4, parse_memory_bytes=2**28,
     )  # fmt: skip
     first_start(settings)
     application = create_app(settings)
@@ -124,6 +124,24 @@ def test_a_file_that_takes_more_memory_than_it_may_is_refused_and_nothing_else(
         sum(1 for _ in made.blobs.stored()), len(http.get(f"/v1/floors/{floor}/surveys").json()["items"]),
     )  # fmt: skip
     assert http.post(url, content=make_walk_csv(77, 4.0, 3.0)).status_code == 202
+
+
+def test_so_many_keys_may_live(context: tuple[Context, TestClient], http: TestClient) -> None:
+    made = [add(http, "/v1/keys", name="k", scopes=["locate"]) for _ in range(2)]
+    assert [answer.status_code for answer in made] == [201, 201]
+    assert is_quota(add(http, "/v1/keys", name="k", scopes=["locate"]), "4 keys")
+    first, second = (answer.json()["id"] for answer in made)
+    assert is_quota(add(http, f"/v1/keys/{first}:rotate", overlap_s=60), "4 keys")
+    rotated = add(http, f"/v1/keys/{first}:rotate", overlap_s=0)
+    assert rotated.status_code == 201, "one comes, one goes"
+    with context[0].transaction() as session:
+        owner = session.query(Floor.organisation_id).limit(1).scalar()
+        session.add(Key(organisation_id=owner, name="s", sha256="0" * 64, scopes=[], issuer="i", subject="anna"))
+    assert http.delete(f"/v1/keys/{second}").status_code == 204
+    last = add(http, "/v1/keys", name="k", scopes=["locate"])
+    assert last.status_code == 201
+    for key in (rotated, last):
+        assert http.delete(f"/v1/keys/{key.json()['id']}").status_code == 204
 
 
 def test_survey_files_may_take_so_many_bytes(context: tuple[Context, TestClient], http: TestClient) -> None:
