@@ -123,6 +123,7 @@ def open_context(settings: Settings) -> Context:
             surveys=settings.max_surveys,
             surveys_per_floor=settings.max_surveys_per_floor,
             survey_bytes=settings.max_survey_bytes,
+            keys=settings.max_keys,
         ),
         bodies=BodyMemory(settings.body_memory_bytes - settings.body_memory_bytes // 4, settings.max_wait_s),
         searches=Turns(threads, "search", settings.max_wait_s, patient=True),

@@ -52,6 +52,7 @@ class Settings(BaseSettings):
     max_surveys: int = Field(default=200_000, ge=1, description="most surveys of one organisation")
     max_surveys_per_floor: int = Field(default=10_000, ge=1, description="most surveys of one floor")
     max_survey_bytes: int = Field(default=2**40, ge=1, description="most bytes of survey files of one organisation")
+    max_keys: int = Field(default=10_000, ge=1, description="most keys of one organisation that have not ended")
     max_wait_s: float = Field(
         default=2.0, gt=0, description="longest wait for a search, a track's batch, or room for a body; else 503"
     )

@@ -1,9 +1,9 @@
-"""Looks after the dead and the forgotten: hands the jobs of dead workers over, closes jobs that the engine gave up, and
-admits those that nobody admitted."""
+"""Looks after the dead and the forgotten: hands the jobs of dead workers over, closes jobs that the engine gave up,
+lets those that it lost wait anew, and admits those that nobody admitted."""
 
 import logging
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dbos import DBOSClient
 from sqlalchemy import select
@@ -14,7 +14,7 @@ from app.jobs.lease import Lease
 from app.telemetry.metrics import WORKERS_TAKEN_OVER
 from workers.janitor import hand_over
 from workers.lifeline import Lifeline
-from workers.reconcile import close_abandoned_jobs, has_unfinished_jobs
+from workers.reconcile import LostJobs, close_abandoned_jobs, has_unfinished_jobs
 from workers.workflows import WorkflowContext
 
 __all__ = ["IDLE_POLL_S", "Reaper"]
@@ -34,6 +34,7 @@ class Reaper:
     lifeline: Lifeline
     client: DBOSClient
     context: WorkflowContext
+    lost: LostJobs = field(default_factory=LostJobs)
 
     def run(self, stop: threading.Event) -> None:
         """Look at once, and then again and again, until told to stop."""
@@ -41,6 +42,7 @@ class Reaper:
             try:
                 self._bury_the_dead()
                 close_abandoned_jobs(self.client, self.context)
+                self.lost.look(self.client, self.context)
                 self._admit_the_waiting()
                 self._set_pace()
             except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied

@@ -1,21 +1,28 @@
-"""Where the engine's records and our job rows meet: what a worker left behind, and jobs the engine gave up."""
+"""Where the engine's records and our job rows meet: what a worker left behind, jobs the engine gave up, and jobs of
+which it has no record."""
 
 import logging
+import time
+from datetime import datetime
 
 from dbos import DBOSClient
 from sqlalchemy import select
 
 from app.db.tables import Job
 from app.jobs.admission import IN_HAND
+from app.jobs.queue import FINAL_STATES
+from app.telemetry.metrics import JOBS_ENDED
 from workers.workflows import WorkflowContext
 
-__all__ = ["close_abandoned_jobs", "has_unfinished_jobs"]
+__all__ = ["LostJobs", "close_abandoned_jobs", "has_unfinished_jobs"]
 
 ABANDONED = {
     "CANCELLED": "cancelled in the job engine by an operator",
     "ERROR": "internal error in the worker; its log has the trace",
     "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "given up: its worker died every time it was tried; see the log of the worker",
 }
+
+LOST_S = 60.0  # far above what a fit takes to end after its next report, tries and all
 
 log = logging.getLogger(__name__)
 
@@ -40,4 +47,45 @@ def close_abandoned_jobs(client: DBOSClient, context: WorkflowContext) -> None:
     for entry in abandoned:
         log.warning("%s ended in the job engine as %s", entry.workflow_id, entry.status)
         with context.sessions.begin() as session:
-            context.builder.fail_build(session, open_jobs[entry.workflow_id], ABANDONED[entry.status])
+            job = session.get(Job, open_jobs[entry.workflow_id], with_for_update=True)
+            if job is None or job.status in FINAL_STATES:  # somebody else was first
+                continue
+            context.builder.fail_build(session, job.id, ABANDONED[entry.status])
+        JOBS_ENDED.labels(job.kind, "failed").inc()
+
+
+class LostJobs:
+    """Jobs in hand of which the engine has no record: it was deleted by hand, or one of the two schemas was restored.
+
+    Nobody would end them, and their slots and floors would be taken for ever. They wait anew, but not before whoever
+    may be at work on one has been stopped: the engine refuses reports on a job that it has no record of.
+    """
+
+    def __init__(self, lost_s: float = LOST_S) -> None:
+        self._lost_s = lost_s
+        self._since: dict[tuple[str, datetime | None], float] = {}
+
+    def look(self, client: DBOSClient, context: WorkflowContext) -> None:
+        """Let those wait anew that have been lost for so long."""
+        with context.sessions() as session:
+            in_hand = session.execute(select(Job.workflow_id, Job.id, Job.admitted_at).where(IN_HAND)).all()
+        known = set()  # asked for later than the jobs: a job and its record are of one transaction
+        if in_hand:
+            names = [row.workflow_id for row in in_hand]
+            entries = client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
+            known = {entry.workflow_id for entry in entries}
+        now_s = time.monotonic()
+        lost = [(row.id, row.admitted_at) for row in in_hand if row.workflow_id not in known]
+        self._since = {each: self._since.get(each, now_s) for each in lost}
+        for (job_id, admitted_at), since_s in self._since.items():
+            if now_s - since_s >= self._lost_s:
+                _let_wait_anew(context, job_id, admitted_at)
+
+
+def _let_wait_anew(context: WorkflowContext, job_id: str, admitted_at: datetime | None) -> None:
+    with context.sessions.begin() as session:
+        job = session.get(Job, job_id, with_for_update=True)
+        if job is None or job.status in FINAL_STATES or job.admitted_at != admitted_at:  # somebody else was first
+            return
+        log.warning("%s is not known to the job engine any more; it waits anew", job.workflow_id)
+        context.queue.enqueue_again(session, job, "its record in the job engine was lost")

@@ -19,12 +19,16 @@ from app.api.ownership import find_own, own
 from app.api.problems import ERROR_RESPONSES
 from app.db.tables import Job
 from app.jobs import FINAL_STATES
+from app.jobs.admission import HIGH, LOW, NORMAL
 from app.services.audit_log import record
 
-__all__ = ["JobView", "router", "show_job"]
+__all__ = ["PRIORITIES", "JobView", "Priority", "router", "show_job"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=ERROR_RESPONSES)
 JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
+Priority = Literal["low", "normal", "high"]
+PRIORITIES: dict[Priority, int] = {"low": LOW, "normal": NORMAL, "high": HIGH}
+_WORDS = {number: word for word, number in PRIORITIES.items()}
 
 
 class JobView(BaseModel):
@@ -35,6 +39,7 @@ class JobView(BaseModel):
     status: JobStatus
     progress: Annotated[int, Field(ge=0, le=100)]
     message: str
+    priority: Annotated[Priority, Field(description="among the waiting jobs of the organisation")]
     floor_id: str
     map_id: str | None
     created: datetime
@@ -47,6 +52,7 @@ def show_job(row: Job) -> JobView:
     return JobView.model_validate(
         {
             "created": row.created_at, "started": row.started_at, "finished": row.finished_at,
+            "priority": _WORDS[row.priority],
             **{name: getattr(row, name) for name in
                ("id", "kind", "status", "progress", "message", "floor_id", "map_id", "result")},
         }

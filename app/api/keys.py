@@ -8,13 +8,12 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import select
 
 from app.api.auth import AdminOnly, Identity, actor
 from app.api.context import ContextDep
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Name, RequestModel, Time
-from app.api.ownership import find_own_key, reaches_key
+from app.api.ownership import find_own_key, own_keys
 from app.api.problems import ERROR_RESPONSES, Forbidden
 from app.db.tables import Key, Organisation
 from app.services.manage_keys import MadeKey, make_key, revoke_key, rotate_key
@@ -78,12 +77,8 @@ def _show_made(made: MadeKey) -> MadeKeyView:
 def list_keys(context: ContextDep, identity: AdminOnly, paging: PagingDep) -> Page[KeyView]:
     """Also those that have ended, and the subjects of an identity provider. A key limited to buildings sees those that
     reach no further."""
-    mine = select(Key).where(Key.organisation_id == identity.organisation_id)
     with context.transaction() as session:
-        if identity.is_limited:
-            within = [row.id for row in session.scalars(mine) if reaches_key(identity, row)]
-            mine = mine.where(Key.id.in_(within))
-        return list_page(session, mine, Key.id, paging, show_key)
+        return list_page(session, own_keys(session, identity), Key.id, paging, show_key)
 
 
 @router.post("", status_code=201, summary="Make a key")
@@ -97,6 +92,7 @@ def create_key(body: NewKey, request: Request, context: ContextDep, identity: Ad
             session, owner, actor(request, identity), name=body.name, scopes=set(body.scopes),
             building_ids=None if body.building_ids is None else set(body.building_ids), expires_at=body.expires_at,
         )  # fmt: skip
+        context.quotas.check_keys(session, identity.organisation_id)
         return _show_made(made)
 
 
@@ -116,7 +112,9 @@ def rotate(
     with context.transaction() as session:
         row = find_own_key(session, identity, key_id)
         overlap = timedelta(seconds=(body or Rotation()).overlap_s)
-        return _show_made(rotate_key(session, row, actor(request, identity), overlap))
+        made = rotate_key(session, row, actor(request, identity), overlap)
+        context.quotas.check_keys(session, identity.organisation_id)
+        return _show_made(made)
 
 
 @router.delete("/{key_id}", status_code=204, summary="Revoke a key")

@@ -18,7 +18,7 @@ from app.api.auth import Identity, MapWriting, Reading, actor
 from app.api.caching import immutable, pointer
 from app.api.context import Context, ContextDep
 from app.api.idempotency import IdempotencyKey, answer_once
-from app.api.jobs import JobView, show_job
+from app.api.jobs import PRIORITIES, JobView, Priority, show_job
 from app.api.listing import Page, PagingDep, list_page
 from app.api.models import Finite, Id, Metres, Point, RequestModel
 from app.api.ownership import find_own
@@ -30,7 +30,6 @@ from app.field.grid import FieldGrid
 from app.field.kernels import base_kernel, is_sum
 from app.field.samples import COMPONENT_NAMES, Components, SampleFrame, richest_components
 from app.field.spec import Kernel, MapSpec, Noise
-from app.jobs.admission import HIGH, LOW, NORMAL
 from app.services.artefacts import layers_from_bytes, samples_from_bytes
 from app.services.audit_log import ACCEPTED, record
 from app.services.exact_limit import TOO_MANY, outgrow_exact
@@ -41,7 +40,6 @@ __all__ = ["MapView", "ready_map", "router"]
 
 router = APIRouter(prefix="/v1", tags=["maps"], responses=ERROR_RESPONSES)
 MAX_FIELD_POINTS = 100_000
-PRIORITIES = {"low": LOW, "normal": NORMAL, "high": HIGH}
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
@@ -79,7 +77,7 @@ class NewMap(RequestModel):
     ] | None = None  # fmt: skip
     activate: bool = True
     priority: Annotated[
-        Literal["low", "normal", "high"],
+        Priority,
         Field(description="among the jobs of your organisation; rebuilds that follow from uploads are low"),
     ] = "normal"
 

@@ -2,14 +2,14 @@
 
 from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, Select, select
+from sqlalchemy import ColumnElement, Select, func, select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from app.api.auth import Identity
 from app.db.tables import Building, Calibration, Floor, Job, Key, Map, Survey, Track
 from app.errors import NotFound
 
-__all__ = ["find_own", "find_own_key", "own"]
+__all__ = ["find_own", "find_own_key", "own", "own_keys"]
 
 Owned = TypeVar("Owned", Building, Calibration, Floor, Survey, Map, Job, Track)
 
@@ -38,15 +38,27 @@ def own(identity: Identity, kind: type[Owned]) -> Select[Any]:
     raise TypeError(f"a {kind.__tablename__} is of no building")
 
 
+def own_keys(session: Session, identity: Identity) -> Select[Any]:
+    """All keys of the organisation that reach no further than the one that asks, for lists."""
+    statement = select(Key).where(Key.organisation_id == identity.organisation_id)
+    within = identity.reach.building_ids
+    if within is None:
+        return statement
+    elements = func.json_each if session.get_bind().dialect.name == "sqlite" else func.json_array_elements_text
+    building = elements(Key.building_ids).table_valued("value")
+    beyond = select(building.c.value).where(building.c.value.not_in(sorted(within)))
+    return statement.where(Key.building_ids.is_not(None), ~beyond.exists())
+
+
 def find_own_key(session: Session, identity: Identity, key_id: str) -> Key:
     """A key of the organisation that reaches no further than the one that asks. Raises NotFound."""
     row = session.get(Key, key_id)
-    if row is None or row.organisation_id != identity.organisation_id or not reaches_key(identity, row):
+    if row is None or row.organisation_id != identity.organisation_id or not _reaches_key(identity, row):
         raise NotFound(f"no key {key_id}")
     return row
 
 
-def reaches_key(identity: Identity, row: Key) -> bool:
+def _reaches_key(identity: Identity, row: Key) -> bool:
     """Whether all that a key reaches is within reach."""
     within = identity.reach.building_ids
     return within is None or (row.building_ids is not None and within.issuperset(row.building_ids))

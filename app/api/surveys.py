@@ -193,8 +193,7 @@ async def upload_survey(
 
     def receive(data: bytes) -> Response:
         UPLOAD_BYTES.observe(len(data))
-        if replaces is None:
-            _check_room(context, floor_id, sha256(data).hexdigest())
+        checked = replaces is None and _check_room(context, floor_id, data)
         with UPLOAD_PARSE_SECONDS.time(), UPLOADS.labels("refused").count_exceptions(IsodynError):
             parsed = parse_survey(
                 context.blobs, data, format=format, frame=frame, name=name or "survey", elevation_m=told.elevation_m,
@@ -208,7 +207,9 @@ async def upload_survey(
             survey, job, new = record_survey(transaction, context.queue, floor, parsed, replaces)
             UPLOADS.labels("new" if new else "known").inc()
             if new:
-                context.quotas.check_surveys(transaction, floor)
+                context.quotas.check_surveys_of_floor(transaction, floor.id)
+                if not checked:
+                    context.quotas.check_surveys(transaction, floor.organisation_id)
                 record(transaction, actor(request, identity), "upload", survey, ACCEPTED if job else DONE,
                        floor_id=floor.id, replaces=replaces, job_id=job.id if job else None)  # fmt: skip
             view = ReceivedSurvey(survey=show_survey(survey), job=show_job(job) if job else None)
@@ -230,13 +231,17 @@ class _Told:
     calibration: AppliedCalibration | None
 
 
-def _check_room(context: Context, floor_id: str, raw_sha256: str) -> None:
-    """Raise QuotaExceeded before anything is stored, but never for a file that is there already."""
+def _check_room(context: Context, floor_id: str, data: bytes) -> bool:
+    """Raise QuotaExceeded before anything is stored. False, and unchecked: the file is there already."""
     with context.transaction() as session:
+        known = Survey.raw_sha256 == sha256(data).hexdigest()
+        there = select(Survey.id).where(Survey.floor_id == floor_id, known).limit(1)
+        if session.scalars(there).first() is not None:
+            return False
+        context.quotas.check_surveys_of_floor(session, floor_id, coming=1)
         floor = session.get_one(Floor, floor_id)
-        there = select(Survey.id).where(Survey.floor_id == floor_id, Survey.raw_sha256 == raw_sha256).limit(1)
-        if session.scalars(there).first() is None:
-            context.quotas.check_surveys(session, floor, coming=1)
+        context.quotas.check_surveys(session, floor.organisation_id, coming=1, coming_bytes=len(data))
+        return True
 
 
 def _told_of(

@@ -27,7 +27,7 @@ ADVICE = {
     errno.ENOSPC: "make room, then send it again; `isodyn clean` forgets what nothing names",
     errno.EDQUOT: "make room or raise the quota, then send it again",
     errno.EROFS: "mount it for writing, then send it again",
-    errno.ENOENT: "is its disk mounted?",
+    errno.ENOENT: "is its disk mounted, and is ISODYN_BLOB_URL or ISODYN_DATA_DIR right? `isodyn doctor` names it",
     errno.EACCES: "the process may not read or write there",
 }
 
@@ -102,6 +102,7 @@ class FolderBlobStore:
         return True
 
     def stored(self) -> Iterator[StoredBlob]:
+        self._look_for_folder()
         for path in sorted(self._folder.glob("[0-9a-f][0-9a-f]/[0-9a-f][0-9a-f]/*")):
             if not is_name(path.name):  # somebody else's file
                 continue

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from app.cli.environment import read_settings
 from app.cli.finding import Finding
-from app.errors import InvalidInput, Unavailable
+from app.errors import InvalidInput, IsodynError, Unavailable
 from app.settings import Settings
 
 __all__ = ["doctor", "examine"]
@@ -117,11 +117,17 @@ def _blobs(settings: Settings) -> Iterator[Finding]:
         return
     url = settings.resolved_blob_url
     try:
-        store = open_blob_store(url)
+        store = open_blob_store(url, make=False)
         sha256 = store.put(b"isodyn doctor " + os.urandom(8))  # nobody else's, and can go again
         store.get(sha256)
         store.discard(sha256)
     except Unavailable as error:
+        if isinstance(error.__cause__, FileNotFoundError) and not _names_blobs(settings):
+            advice = (
+                "`isodyn serve` makes that of a new installation; of another, mount its disk or correct the settings"
+            )
+            yield Finding("blob store", None, f"{url}: there is no such folder", advice)
+            return
         cause = str(error.__cause__).splitlines()[0][:400]
         yield Finding("blob store", False, f"{url}: {cause}", str(error))
         return
@@ -129,6 +135,20 @@ def _blobs(settings: Settings) -> Iterator[Finding]:
         yield Finding("blob store", False, "no address of a blob store", str(error))
         return
     yield Finding("blob store", True, f"{url}: written, read and cleaned")
+
+
+def _names_blobs(settings: Settings) -> bool:
+    """Whether there is a database that can be read, and a row in it names a blob."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from app.cli.installation import open_installation
+    from app.services.references import references
+
+    try:
+        with open_installation(settings) as here, here.sessions() as session:
+            return bool(references(session).all)
+    except (IsodynError, SQLAlchemyError):  # a finding of its own
+        return False
 
 
 def _port(settings: Settings) -> Iterator[Finding]:

@@ -33,7 +33,8 @@ class Installation:
 
 @contextmanager
 def open_installation(settings: Settings) -> Iterator[Installation]:
-    """What the settings name. Raises NotFound where there is none, Conflict where its schema is of another version."""
+    """What the settings name; a blob folder that is not there is not made. Raises NotFound where there is no database,
+    Conflict where its schema is of another version."""
     url = make_url(settings.resolved_database_url)
     if url.get_backend_name() == "sqlite" and not Path(str(url.database)).exists():
         raise NotFound(f"there is no database {url.database}: is ISODYN_DATA_DIR the folder of the installation?")
@@ -46,7 +47,8 @@ def open_installation(settings: Settings) -> Iterator[Installation]:
             )
         queue = JobQueue(engine)
         try:
-            yield Installation(engine, session_factory(engine), open_blob_store(settings.resolved_blob_url), queue)
+            blobs = open_blob_store(settings.resolved_blob_url, make=False)
+            yield Installation(engine, session_factory(engine), blobs, queue)
         finally:
             queue.close()
     finally:

@@ -131,6 +131,8 @@ class Audit(Base):
     __tablename__ = "audit"
     __table_args__ = (
         Index("ix_audit_organisation_id_id", "organisation_id", "id"),
+        Index("ix_audit_organisation_id_key_id_id", "organisation_id", "key_id", "id"),
+        Index("ix_audit_organisation_id_action_id", "organisation_id", "action", "id"),
         Index("ix_audit_object_id", "object_id"),
     )
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=new_id)

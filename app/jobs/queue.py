@@ -102,13 +102,13 @@ class JobQueue:
         session.flush()
         return job
 
-    def enqueue_again(self, session: Session, job: Job) -> None:
+    def enqueue_again(self, session: Session, job: Job, why: str) -> None:
         """Let a job that had not ended wait anew under its old name, where the engine knows nothing of it.
 
-        For a database that was restored: the engine's own tables are not restored with ours.
+        After a restore, which does not bring the engine's own tables back, and where its record was lost.
         """
         job.status, job.progress, job.started_at, job.admitted_at = "accepted", 0, None, None
-        job.message = "waiting for a worker, anew: the installation was restored from a backup"
+        job.message = f"waiting for a worker, anew: {why}"
         begun = update(Map).where(Map.id == job.map_id, Map.status == "running")
         session.execute(begun.values(status="accepted"))
 

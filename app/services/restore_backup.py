@@ -132,6 +132,6 @@ def _begin_jobs_anew(connection: Connection, queue: JobQueue) -> int:
     with Session(connection, join_transaction_mode="rollback_only") as session:
         open_jobs = session.scalars(select(Job).where(Job.status.not_in(FINAL_STATES)).order_by(Job.id)).all()
         for job in open_jobs:
-            queue.enqueue_again(session, job)
+            queue.enqueue_again(session, job, "the installation was restored from a backup")
         session.flush()
         return len(open_jobs)

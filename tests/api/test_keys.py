@@ -7,8 +7,10 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+from sqlalchemy import event
 
 from app.api import auth
+from app.db.tables import Key
 from app.services import key_ring
 
 
@@ -146,8 +148,24 @@ def test_a_limited_key_makes_no_building_and_no_wider_key(
         body = {"name": "x", "scopes": ["admin"], **wider}
         assert service.http.post("/v1/keys", json=body, headers=headers).status_code == 403
     body = {"name": "x", "scopes": ["admin"], "building_ids": [ids["building_id"]]}
-    made = service.http.post("/v1/keys", json=body, headers=headers)
-    assert made.status_code == 201
-    listed = service.http.get("/v1/keys", headers=headers).json()["items"]
-    assert made.json()["id"] in [each["id"] for each in listed]
-    assert all(each["building_ids"] == [ids["building_id"]] for each in listed)
+    made = [service.http.post("/v1/keys", json=body, headers=headers) for _ in range(2)]
+    assert [answer.status_code for answer in made] == [201, 201]
+    for beyond in ([elsewhere], sorted((ids["building_id"], elsewhere))):
+        make(service, building_ids=beyond)
+    looked: list[int] = []
+
+    def count(_session: object, _row: object) -> None:
+        looked.append(1)
+
+    event.listen(Key, "load", count)
+    url, listed = "/v1/keys?limit=1&order=newest", []
+    while url and len(listed) < 2:
+        looked.clear()
+        page = service.http.get(url, headers=headers).json()
+        assert len(looked) <= 3, "no more keys are loaded than a page has, the next, and the one that asks"
+        listed += page["items"]
+        url = page["links"].get("next")
+    event.remove(Key, "load", count)
+    assert [each["id"] for each in listed] == [answer.json()["id"] for answer in reversed(made)]
+    every = service.http.get("/v1/keys?limit=200", headers=headers).json()["items"]
+    assert all(each["building_ids"] == [ids["building_id"]] for each in every)

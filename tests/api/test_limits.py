@@ -9,6 +9,7 @@ from threading import Event
 from typing import Any
 
 import pytest
+from sqlalchemy import event
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.testclient import TestClient
@@ -19,7 +20,7 @@ from app.api.auth import recognised
 from app.api.body import BodyLimit, upload
 from app.api.context import Context
 from app.api.key_limits import KeyLimits
-from app.db.tables import Floor, Survey
+from app.db.tables import Floor, Key, Survey
 from app.errors import Overloaded, QuotaExceeded, TooMany
 from app.main import create_app, first_start
 from app.services.manage_keys import create_key
@@ -36,7 +37,7 @@ def context(database_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iter
     settings = Settings(
         data_dir=tmp_path_factory.mktemp("data"), database_url=database_url, admin_key=ADMIN, max_buildings=3,
         max_floors_per_building=2, max_surveys_per_floor=2, max_surveys=3, max_requests_per_s=50.0,
-        max_requests_per_key=5, parse_memory_bytes=2**28,
+        max_requests_per_key=5, max_keys=4, parse_memory_bytes=2**28,
     )  # fmt: skip
     first_start(settings)
     application = create_app(settings)
@@ -62,7 +63,7 @@ def is_quota(answer: Any, words: str) -> bool:
     return bool(answer.status_code == 409 and told["type"].endswith("/quota") and words in told["detail"])
 
 
-def test_an_organisation_may_keep_so_much(http: TestClient) -> None:
+def test_an_organisation_may_keep_so_much(context: tuple[Context, TestClient], http: TestClient) -> None:
     building = add(http, "/v1/buildings", name="A").json()["id"]
     floors = [add(http, f"/v1/buildings/{building}/floors", name="F", ordinal=k, auto_build=False).json()["id"]
               for k in (0, 1)]  # fmt: skip
@@ -75,14 +76,26 @@ def test_an_organisation_may_keep_so_much(http: TestClient) -> None:
         assert add(http, "/v1/buildings", name=name).status_code == 201
     assert is_quota(add(http, "/v1/buildings", name="D"), "3 buildings")
 
+    counted: list[str] = []
+
+    def note(_c: object, _u: object, statement: str, *_: object) -> None:
+        if "count(" in statement and "survey.organisation_id =" in statement:
+            counted.append(statement)
+
+    event.listen(context[0].engine, "before_cursor_execute", note)
+
     def upload(floor: str, seed: int, query: str = "") -> Any:
+        counted.clear()
         return http.post(f"/v1/floors/{floor}/surveys{query}", content=make_walk_csv(seed, 4.0, 3.0))
 
     first = upload(floors[0], 1).json()["survey"]["id"]
     assert upload(floors[0], 2).status_code == 202
+    assert len(counted) == 1, "all surveys of the organisation are counted once an upload"
     assert is_quota(upload(floors[0], 3), "2 surveys")
     assert upload(floors[0], 1).status_code == 200, "what is there already may be sent again"
+    assert counted == []
     assert upload(floors[0], 3, f"?replaces={first}").status_code == 202, "one comes, one goes"
+    assert len(counted) == 1
     assert upload(floors[1], 4).status_code == 202
     assert is_quota(upload(floors[1], 5), "3 surveys")
     blobs = sum(1 for _ in http.app.state.context.blobs.stored())  # type: ignore[attr-defined]
@@ -91,6 +104,7 @@ def test_an_organisation_may_keep_so_much(http: TestClient) -> None:
     survey = http.get(f"/v1/floors/{floors[1]}/surveys").json()["items"][0]["id"]
     assert http.delete(f"/v1/surveys/{survey}").status_code == 204
     assert upload(floors[1], 5).status_code == 202
+    event.remove(context[0].engine, "before_cursor_execute", note)
 
 
 def test_a_file_that_takes_more_memory_than_it_may_is_refused_and_nothing_else(
@@ -112,6 +126,24 @@ def test_a_file_that_takes_more_memory_than_it_may_is_refused_and_nothing_else(
     assert http.post(url, content=make_walk_csv(77, 4.0, 3.0)).status_code == 202
 
 
+def test_so_many_keys_may_live(context: tuple[Context, TestClient], http: TestClient) -> None:
+    made = [add(http, "/v1/keys", name="k", scopes=["locate"]) for _ in range(2)]
+    assert [answer.status_code for answer in made] == [201, 201]
+    assert is_quota(add(http, "/v1/keys", name="k", scopes=["locate"]), "4 keys")
+    first, second = (answer.json()["id"] for answer in made)
+    assert is_quota(add(http, f"/v1/keys/{first}:rotate", overlap_s=60), "4 keys")
+    rotated = add(http, f"/v1/keys/{first}:rotate", overlap_s=0)
+    assert rotated.status_code == 201, "one comes, one goes"
+    with context[0].transaction() as session:
+        owner = session.query(Floor.organisation_id).limit(1).scalar()
+        session.add(Key(organisation_id=owner, name="s", sha256="0" * 64, scopes=[], issuer="i", subject="anna"))
+    assert http.delete(f"/v1/keys/{second}").status_code == 204
+    last = add(http, "/v1/keys", name="k", scopes=["locate"])
+    assert last.status_code == 201
+    for key in (rotated, last):
+        assert http.delete(f"/v1/keys/{key.json()['id']}").status_code == 204
+
+
 def test_survey_files_may_take_so_many_bytes(context: tuple[Context, TestClient], http: TestClient) -> None:
     made, _ = context
     with made.transaction() as session:
@@ -119,9 +151,11 @@ def test_survey_files_may_take_so_many_bytes(context: tuple[Context, TestClient]
         assert floor is not None
         size = sum(survey.raw_bytes or 0 for survey in session.query(Survey))
         assert size > 0
-        replace(made.quotas, survey_bytes=size).check_surveys(session, floor)
-        with pytest.raises(QuotaExceeded, match="would be more than"):
-            replace(made.quotas, survey_bytes=size - 1).check_surveys(session, floor)
+        exact = replace(made.quotas, survey_bytes=size)
+        exact.check_surveys(session, floor.organisation_id)
+        for quotas, coming_bytes in ((exact, 1), (replace(made.quotas, survey_bytes=size - 1), 0)):
+            with pytest.raises(QuotaExceeded, match="would be more than"):
+                quotas.check_surveys(session, floor.organisation_id, coming_bytes=coming_bytes)
 
 
 def test_a_key_that_asks_too_often_is_told_when_it_may(http: TestClient) -> None:

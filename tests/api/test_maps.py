@@ -226,6 +226,9 @@ def test_a_priority_is_of_the_job_not_of_the_map(service: Any, mapped_floor: str
 
     asked = {priority: ask(priority) for priority in ("low", "normal", "high")}
     assert {answer.status_code for answer in asked.values()} == {202}
+    assert {priority: answer.json()["job"]["priority"] for priority, answer in asked.items()} == {
+        "low": "low", "normal": "normal", "high": "high",
+    }  # fmt: skip
     assert ask("urgent").status_code == 422
     service.run_jobs()
     maps = [service.http.get(f"/v1/maps/{answer.json()['map']['id']}").json() for answer in asked.values()]

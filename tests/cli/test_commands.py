@@ -177,6 +177,18 @@ def test_a_deep_look_finds_damaged_and_missing_blobs(data_dir: Path) -> None:
     assert "missing blobs" in result.output
     assert "calibration.samples_sha256" in result.output.replace("\n", "")
     assert runner.invoke(main, ["doctor"]).exit_code == 0
+    away = (data_dir / "blobs").rename(data_dir / "away")
+    for mounted in (False, True):  # the folder is gone, and the empty one where its disk is mounted
+        for command in (["doctor"], ["clean"], ["clean", "--dry-run"], ["backup", str(data_dir / "b.zip")]):
+            result = runner.invoke(main, command)
+            said = " ".join(result.output.replace("│", " ").split())
+            assert result.exit_code == (1 if command == ["doctor"] else 2), said
+            assert "ISODYN_BLOB_URL" in said, said
+            assert (data_dir / "blobs").exists() is mounted
+        if not mounted:
+            (data_dir / "blobs").mkdir()
+    assert not list((data_dir / "blobs").iterdir())
+    assert away.is_dir()
 
 
 def test_openapi_is_written(data_dir: Path, tmp_path: Path) -> None:

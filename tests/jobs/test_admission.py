@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import pytest
+from prometheus_client import REGISTRY
 from sqlalchemy import Engine, delete, select, text, update
 from sqlalchemy.orm import Session, sessionmaker
 
@@ -15,7 +16,7 @@ from app.jobs import JobQueue
 from app.jobs.admission import HIGH, LOW, NORMAL
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from workers.builder import DEFAULT_BUILDER, load_builder
-from workers.reconcile import close_abandoned_jobs
+from workers.reconcile import LostJobs, close_abandoned_jobs
 from workers.workflows import WorkflowContext
 
 if TYPE_CHECKING:
@@ -91,6 +92,16 @@ def test_without_a_worker_jobs_wait_in_our_table_only(site: "Site", hire: Hire, 
     assert site.job(job_id).status == "accepted"
 
 
+def context_of(site: "Site") -> WorkflowContext:
+    """What the reaper of a worker works with."""
+    return WorkflowContext(site.sessions, site.queue, "", load_builder(DEFAULT_BUILDER), DEFAULT_BUILDER)
+
+
+def ended() -> float:
+    """The rebuilds that failed, as `/metrics` of a worker counts them."""
+    return REGISTRY.get_sample_value("isodyn_jobs_ended_total", {"kind": "rebuild", "outcome": "failed"}) or 0.0
+
+
 def test_one_with_many_waiting_does_not_starve_the_others(site: "Site", hire: Hire) -> None:
     hire(2)
     first = upload(site, site.floors(20))
@@ -157,9 +168,7 @@ def test_a_waiting_job_that_is_cancelled_makes_room(site: "Site", hire: Hire) ->
     assert [job.id for job in in_hand(site)] == [second]
 
 
-def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(
-    site: "Site", hire: Hire, engine: Engine, sessions: sessionmaker[Session]
-) -> None:
+def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(site: "Site", hire: Hire, engine: Engine) -> None:
     """More than a statement may have parameters."""
     hire(1)
     given_up, waiting = upload(site, site.floors(2))
@@ -175,12 +184,48 @@ def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(
         )
     client = open_client(engine)
     client.cancel_workflow(site.job(given_up).workflow_id)
-    builder = load_builder(DEFAULT_BUILDER)
-    close_abandoned_jobs(client, WorkflowContext(sessions, site.queue, "", builder, DEFAULT_BUILDER))
+    before = ended()
+    for _ in range(2):
+        close_abandoned_jobs(client, context_of(site))
     client.destroy()
     assert site.job(given_up).status == "failed"
+    assert ended() == before + 1
     admit(site)
     assert [job.id for job in in_hand(site)] == [waiting]
+
+
+@pytest.mark.parametrize("status", ["accepted", "running"])
+def test_a_job_whose_record_in_the_engine_is_lost_waits_anew_once(
+    site: "Site", hire: Hire, engine: Engine, status: str
+) -> None:
+    hire(2)
+    floors = site.floors(2)
+    lost, sound = ask(site, floors[0], NORMAL), ask(site, floors[1], NORMAL)
+    with site.sessions.begin() as session:
+        job = session.get_one(Job, lost)
+        job.status, job.progress = status, 40
+        session.get_one(Map, job.map_id).status = status
+    sound_since = site.job(sound).admitted_at
+    client = open_client(engine)
+    patient, first, second = LostJobs(), LostJobs(0.0), LostJobs(0.0)
+    client.delete_workflows([job.workflow_id])
+    patient.look(client, context_of(site))
+    assert site.job(lost).status == status, "whoever is at work on it is given time to notice"
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda each: each.look(client, context_of(site)), (first, second)))
+    waiting = site.job(lost)
+    assert (waiting.status, waiting.progress, waiting.admitted_at) == ("accepted", 0, None)
+    assert "lost" in waiting.message
+    with site.sessions() as session:
+        assert session.get_one(Map, waiting.map_id).status == "accepted"
+    admit(site)
+    again = site.job(lost).admitted_at
+    assert again is not None
+    for each in (first, second, patient):
+        each.look(client, context_of(site))
+    client.destroy()
+    assert (site.job(lost).admitted_at, site.job(sound).admitted_at) == (again, sound_since)
+    assert known_to_the_engine(engine).count(job.workflow_id) == 1
 
 
 def test_beside_a_worker_of_an_older_version_all_are_admitted(site: "Site", hire: Hire) -> None:
@@ -213,7 +258,7 @@ def test_jobs_of_a_restored_database_are_admitted_anew(site: "Site", hire: Hire,
     (job_id,) = upload(site, [site.floor()])
     hire(1)
     with site.sessions.begin() as session:
-        queue.enqueue_again(session, session.get_one(Job, job_id))
+        queue.enqueue_again(session, session.get_one(Job, job_id), "restored")
     assert in_hand(site) == []
     admit(site)
     assert [job.id for job in in_hand(site)] == [job_id]

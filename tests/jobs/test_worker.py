@@ -13,6 +13,7 @@ from sqlalchemy import select
 from app.blobs import FolderBlobStore
 from app.db.tables import Floor, Job, Map, Survey
 from app.jobs.engine import open_client
+from workers.reconcile import LOST_S
 
 if TYPE_CHECKING:
     from conftest import Crew, Site
@@ -185,6 +186,22 @@ def test_a_job_cancelled_in_the_engine_by_an_operator_does_not_stay_open(crew: "
     job = site.wait(running)
     assert (job.status, job.message) == ("failed", "cancelled in the job engine by an operator")
     assert site.wait(site.upload(floor)[1]).status == "successful"
+
+
+@pytest.mark.slow
+def test_a_running_job_whose_record_in_the_engine_is_lost_is_done_anew(crew: "Crew", site: "Site") -> None:
+    """The fit that was at work on it is stopped long before."""
+    floor = site.floor(sleep_s=5.0)
+    _, job_id = site.upload(floor)
+    site.wait_running(job_id)
+    client = open_client(site.engine)
+    client.delete_workflows([site.job(job_id).workflow_id])
+    client.destroy()
+    job = site.wait(job_id, patience_s=2 * LOST_S)
+    assert job.status == "successful"
+    *stopped, last = [entry["at"] for entry in crew.diary(event="fit starts", map_id=job.map_id)]
+    assert last - stopped[-1] > LOST_S / 2
+    assert len(crew.diary(event="fit ends", map_id=job.map_id)) == 1
 
 
 def test_the_workers_log_says_nothing_untoward(crew: "Crew") -> None:
