@@ -116,7 +116,9 @@ def _tell(scope: Scope, method: str, route: str, seen: _Seen) -> None:
         HTTP_SECONDS.labels(method, route).observe(seen.seconds)
     else:
         method = "WEBSOCKET"
-    level = logging.ERROR if seen.status >= 500 else logging.DEBUG if route in _PROBES else logging.INFO
+    level = logging.DEBUG if route in _PROBES else logging.INFO
+    if seen.status >= 500:
+        level = logging.WARNING if seen.status == 503 else logging.ERROR
     identity: Any = scope["state"].get("identity")
     _log.log(
         level, "%s %s %d %.1f ms", method, route, seen.status, 1e3 * seen.seconds,

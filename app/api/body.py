@@ -82,13 +82,13 @@ class _Body:
 
 
 @asynccontextmanager
-async def upload(request: Request, max_bytes: int, memory: BodyMemory) -> AsyncIterator[bytes]:
-    """The body of an upload, decompressed by its Content-Encoding (identity, gzip, zstd), which holds its memory until
-    the block is left.
+async def upload(request: Request, max_bytes: int, memory: BodyMemory, organisation_id: str) -> AsyncIterator[bytes]:
+    """The body of an organisation's upload, decompressed by its Content-Encoding (identity, gzip, zstd), which holds
+    its memory until the block is left.
 
     Both the bytes sent and the bytes they unpack to are limited, so a small file that unpacks to a huge one is
     refused when it crosses the limit, not after. Raises TooLarge, TooSlow, InvalidInput (damaged or unknown encoding),
-    and Overloaded before anything is read.
+    and Overloaded and TooMany before anything is read.
     """
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding not in ("identity", "", *_UNPACK):
@@ -101,11 +101,13 @@ async def upload(request: Request, max_bytes: int, memory: BodyMemory) -> AsyncI
         raise _too_large(max_bytes)
     async with AsyncExitStack() as held:
         plain = encoding not in _UNPACK
-        await held.enter_async_context(memory.room(int(said) if said.isdigit() and plain else max_bytes))
+        await held.enter_async_context(
+            memory.room(int(said) if said.isdigit() and plain else max_bytes, organisation_id)
+        )
         data = await _collect(request.stream(), max_bytes)
         if plain and (encoding := _packed_as(data)) in _UNPACK:  # what it unpacks to may be far more than was said
             await held.aclose()
-            await held.enter_async_context(memory.room(max_bytes))
+            await held.enter_async_context(memory.room(max_bytes, organisation_id))
         yield data if encoding not in _UNPACK else await run_in_threadpool(_UNPACK[encoding], data, max_bytes)
 
 

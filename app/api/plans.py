@@ -64,7 +64,7 @@ async def put_plan(
         return _point_to(context, request, identity, floor_id, plan)
 
     context.uploads.check()
-    async with upload(request, MAX_PLAN_BYTES, context.bodies) as data:
+    async with upload(request, MAX_PLAN_BYTES, context.bodies, identity.organisation_id) as data:
         return await context.uploads.run(lambda: receive(data), request.is_disconnected)
 
 

@@ -90,7 +90,7 @@ async def replay(
         return replay_walk(walk, floors, window_m, every_m)
 
     context.uploads.check()
-    async with upload(request, context.settings.max_upload_bytes, context.bodies) as data:
+    async with upload(request, context.settings.max_upload_bytes, context.bodies, identity.organisation_id) as data:
         begun = await context.uploads.run(lambda: begin(data), request.is_disconnected)
     context.searches.check()
     return StreamingResponse(_lines(context, floor_id, begun), media_type="application/x-ndjson")

@@ -218,7 +218,7 @@ async def upload_survey(
         return answer_once(context, identity, request, key, parsed.raw_sha256.encode(), create)
 
     context.uploads.check()
-    async with upload(request, context.settings.max_upload_bytes, context.bodies) as data:
+    async with upload(request, context.settings.max_upload_bytes, context.bodies, identity.organisation_id) as data:
         return await context.uploads.run(lambda: receive(data), request.is_disconnected)
 
 

@@ -20,20 +20,21 @@ from app.services.receive_plan import LONGEST_SIDE_PX, MAX_PIXELS, Picture
 from app.survey.columns import MAX_SAMPLES
 from app.survey.walk import DeadReckoning, Walk
 
-__all__ = ["CONTROL", "END", "FORK", "FORGET", "LENGTH", "MAX_ANSWER_BYTES", "NUMBER", "OUT_OF_MEMORY",
-           "answer_to_bytes", "failure_to_bytes", "order_header", "order_of", "refusal_to_bytes", "told"]  # fmt: skip
+__all__ = ["CONTROL", "END", "FORK", "FORGET", "LENGTH", "MAX_ANSWER_BYTES", "NO_FAULT_OF_THE_FILE", "NUMBER",
+           "OUT_OF_MEMORY", "answer_to_bytes", "failure_to_bytes", "order_header", "order_of", "refusal_to_bytes",
+           "told"]  # fmt: skip
 
 FORK, END, FORGET = 0, 1, 2
 CONTROL = struct.Struct("<qqQ")
 """What, a number, memory in bytes. FORK comes with the child's socket and its processor seconds, and is answered by its
-process id; END has that id: the child is killed if it still runs, and the answer is its exit code, or minus the signal
-that ended it. FORGET is END without an answer."""
+process id, or by minus the error where there can be none; END has that id: the child is killed if it still runs, and
+the answer is its exit code, or minus the signal that ended it. FORGET is END without an answer."""
 NUMBER = struct.Struct("<q")
 LENGTH = struct.Struct("<Q")
 """Before an order's header, its file, and an answer."""
 
-OUT_OF_MEMORY = 3
-"""A child's exit code."""
+OUT_OF_MEMORY, NO_FAULT_OF_THE_FILE = 3, 4
+"""Exit codes of a child that gave no answer."""
 MAX_ANSWER_BYTES = 768 * 2**20
 """Samples and dead reckoning of the longest survey are less."""
 MAX_REPORT_BYTES = 4 * 2**20

@@ -7,6 +7,7 @@ started without them.
 """
 
 import array
+import errno
 import gc
 import io
 import os
@@ -29,6 +30,7 @@ from app.services.file_messages import (
     END,
     FORK,
     LENGTH,
+    NO_FAULT_OF_THE_FILE,
     NUMBER,
     OUT_OF_MEMORY,
     answer_to_bytes,
@@ -52,11 +54,12 @@ def main() -> None:
         while said := _receive(control):
             (what, number, memory_bytes), descriptors = said
             if what == FORK:
-                number = os.fork()
+                number = _fork()
                 if number == 0:
                     control.close()
                     _read_one(socket.socket(fileno=descriptors[0]), said[0][1], memory_bytes)
-                children.add(number)
+                if number > 0:
+                    children.add(number)
                 for descriptor in descriptors:
                     os.close(descriptor)
                 control.sendall(NUMBER.pack(number))
@@ -83,6 +86,14 @@ def _receive(control: socket.socket) -> tuple[tuple[int, int, int], list[int]] |
     return CONTROL.unpack(said), list(descriptors)
 
 
+def _fork() -> int:
+    """As `os.fork`; minus the error where that fails, which the other children do not notice."""
+    try:
+        return os.fork()
+    except OSError as error:
+        return -(error.errno or errno.EAGAIN)
+
+
 def _end(child: int) -> int:
     ended, status = os.waitpid(child, os.WNOHANG)
     if not ended:
@@ -93,7 +104,7 @@ def _end(child: int) -> int:
 
 def _read_one(channel: socket.socket, cpu_s: int, memory_bytes: int) -> NoReturn:
     """The child."""
-    code = 1
+    code = NO_FAULT_OF_THE_FILE
     try:
         _confine(cpu_s, memory_bytes)
         stream = channel.makefile("rb")
@@ -104,12 +115,14 @@ def _read_one(channel: socket.socket, cpu_s: int, memory_bytes: int) -> NoReturn
         except (InvalidInput, TooLarge) as error:
             answer = refusal_to_bytes(error)
         except MemoryError:
-            os._exit(OUT_OF_MEMORY)
+            raise
         except Exception:  # a fault of ours, for the log of the web process
             answer = failure_to_bytes(traceback.format_exc())
         channel.sendall(LENGTH.pack(len(answer)))
         channel.sendall(answer)
         code = 0
+    except MemoryError:
+        code = OUT_OF_MEMORY
     finally:
         os._exit(code)
 

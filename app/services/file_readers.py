@@ -1,6 +1,8 @@
 """Foreign files, read in processes of their own (`app.services.file_process`), under bounds of memory and time.
 
 A file that kills its process, or takes more than it may, is refused; this process, and other files, are not affected.
+Where a process is killed by somebody else (the kernel, for lack of memory), or there can be none, the file is not to
+blame: Unavailable.
 """
 
 import array
@@ -11,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from math import ceil
 from threading import BoundedSemaphore, Lock
 from time import monotonic
@@ -23,6 +26,7 @@ from app.services.file_messages import (
     FORK,
     LENGTH,
     MAX_ANSWER_BYTES,
+    NO_FAULT_OF_THE_FILE,
     NUMBER,
     OUT_OF_MEMORY,
     order_header,
@@ -37,6 +41,7 @@ __all__ = ["FileReaders"]
 _log = logging.getLogger(__name__)
 _START_S = 60.0
 _ENDED = "it ended the process that read it, by its size or by a fault in it; write it anew, in another format"
+_NOT_ITS_FAULT = frozenset({NO_FAULT_OF_THE_FILE, -signal.SIGKILL})
 _PASSED_ON = frozenset({"PATH", "PYTHONPATH", "LANG", "LC_ALL", "TZ", "LD_LIBRARY_PATH", "VIRTUAL_ENV"})
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
                 "PYTHONUNBUFFERED": "1"}  # fmt: skip
@@ -59,13 +64,13 @@ class FileReaders:
         self._running()
 
     def survey(self, order: SurveyOrder) -> Walk:
-        """As `read_on_floor`. Raises UnreadableSurvey, TooLarge, and Unavailable where no process can be started."""
+        """As `read_on_floor`. Raises UnreadableSurvey, TooLarge, and Unavailable where no process can read it."""
         answer = self._read(order, UnreadableSurvey)
         assert isinstance(answer, Walk)
         return answer
 
     def picture(self, data: bytes) -> Picture:
-        """As `redraw`. Raises InvalidInput, TooLarge, and Unavailable where no process can be started."""
+        """As `redraw`. Raises InvalidInput, TooLarge, and Unavailable where no process can read it."""
         answer = self._read(PictureOrder(data), InvalidInput)
         assert isinstance(answer, Picture)
         return answer
@@ -82,6 +87,8 @@ class FileReaders:
             answer, code = self._ask(order)
         if answer is None:
             _log.warning("a file's reader ended without an answer: %s", "too slow" if code is None else code)
+            if code in _NOT_ITS_FAULT:
+                raise Unavailable("the process that read the file was ended, for lack of memory perhaps; send it again")
             why = self._why(code)
         else:
             try:
@@ -145,15 +152,19 @@ class _Program:
     def __init__(self) -> None:
         self._control, theirs = socket.socketpair()
         self._turn = Lock()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "app.services.file_process", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                env={name: os.environ[name] for name in _PASSED_ON if name in os.environ} | _ENVIRONMENT,
-                start_new_session=True,  # a Ctrl-C is for the web process, which decides what becomes of its files
-            )
+        try:
+            with theirs:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "app.services.file_process", str(theirs.fileno())],
+                    pass_fds=(theirs.fileno(),),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    env={name: os.environ[name] for name in _PASSED_ON if name in os.environ} | _ENVIRONMENT,
+                    start_new_session=True,  # a Ctrl-C is for the web process, which decides what becomes of its files
+                )
+        except OSError as error:
+            self._control.close()
+            raise Unavailable("the process that reads files cannot be started now; send it again") from error
         try:
             self._control.settimeout(_START_S)
             self._number()
@@ -162,24 +173,37 @@ class _Program:
             raise Unavailable("the process that reads files did not start; the server's log says more") from error
 
     def fork(self, channel: socket.socket, cpu_s: int, memory_bytes: int) -> int:
-        """A new child that serves this socket: its process id."""
-        with self._turn:
+        """A new child that serves this socket: its process id. Raises Unavailable where there can be none."""
+        with self._exchange():
             descriptors = array.array("i", [channel.fileno()])
             rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, descriptors)
             self._control.sendmsg([CONTROL.pack(FORK, cpu_s, memory_bytes)], [rights])
-            return self._number()
+            number = self._number()
+        if number < 0:
+            raise Unavailable(f"no process can be started to read the file: {os.strerror(-number)}; send it again")
+        return number
 
     def end(self, child: int) -> int:
         """See that a child is gone: its exit code, or minus the signal that ended it."""
-        with self._turn, contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), self._exchange():
             self._control.sendall(CONTROL.pack(END, child, 0))
             return self._number()
         return -signal.SIGKILL
 
     def forget(self, child: int) -> None:
         """The same, without waiting for it."""
-        with self._turn, contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), self._exchange():
             self._control.sendall(CONTROL.pack(FORGET, child, 0))
+
+    @contextlib.contextmanager
+    def _exchange(self) -> Iterator[None]:
+        """One at a time, and none after one that failed: its answer, come late, would be taken for that to the next."""
+        with self._turn:
+            try:
+                yield
+            except OSError:
+                self._control.close()
+                raise
 
     def close(self) -> None:
         self._control.close()  # it kills its children, and ends
@@ -205,7 +229,7 @@ def _converse(channel: socket.socket, order: Order, deadline: float) -> bytes | 
         channel.sendall(part)
     (length,) = LENGTH.unpack(_received(channel, LENGTH.size, deadline))
     if length > MAX_ANSWER_BYTES:
-        raise ConnectionError("an impossible answer")
+        return b""  # which is not believed
     return bytes(_received(channel, length, deadline))
 
 

@@ -20,6 +20,7 @@ T = TypeVar("T")
 _LATELY = 10  # pieces of work that say how long the next will take
 _MOST_WAITING = 2000
 _LOOKS_AFTER_S = 0.05  # of waiting: has the client gone?
+_TOLD_WITHIN_S = 5.0  # by the event loop, which may have stopped for good
 
 
 class Turns(ContextExecutor):
@@ -78,8 +79,12 @@ class Turns(ContextExecutor):
                 )
             if gone is not None and waited_s > _LOOKS_AFTER_S:
                 left = asyncio.run_coroutine_threadsafe(_said(gone), loop)
-                if left.result():
-                    raise Overloaded("the client has gone")
+                try:
+                    if left.result(_TOLD_WITHIN_S):
+                        raise Overloaded("the client has gone")
+                except TimeoutError:
+                    left.cancel()
+                    raise Overloaded("the server is stopping, or too busy to go on; try again later") from None
             return work()
 
         return await loop.run_in_executor(self, begin)

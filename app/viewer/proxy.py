@@ -21,12 +21,22 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
-__all__ = ["CLOSE_SIGNED_OUT", "CLOSE_UNREACHABLE", "PAGE_POLICY", "ViserPage", "fetch_page", "passes", "relay"]
+__all__ = [
+    "CLOSE_FULL",
+    "CLOSE_SIGNED_OUT",
+    "CLOSE_UNREACHABLE",
+    "PAGE_POLICY",
+    "ViserPage",
+    "fetch_page",
+    "passes",
+    "relay",
+]
 
 _log = logging.getLogger(__name__)
 
 CLOSE_SIGNED_OUT = 4401
 CLOSE_UNREACHABLE = 1011
+CLOSE_FULL = 1013
 _MOST_MESSAGE_BYTES = 64 * 2**10  # of a message from the browser: a camera or a control is far smaller
 _MOST_SCENE_BYTES = 64 * 2**20
 

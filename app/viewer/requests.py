@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
+from math import ceil
 from typing import TypeVar
 from urllib.parse import parse_qs, urlsplit
 
@@ -85,4 +86,7 @@ _STATUS: dict[type[IsodynError], HTTPStatus] = {
 def problem(error: IsodynError) -> Response:
     """An error of ours as a refusal."""
     known = (status for kind, status in _STATUS.items() if isinstance(error, kind))
-    return refusal(next(known, HTTPStatus.INTERNAL_SERVER_ERROR), str(error), error.faults)
+    answer = refusal(next(known, HTTPStatus.INTERNAL_SERVER_ERROR), str(error), error.faults)
+    if isinstance(error, Unavailable):
+        answer.headers["Retry-After"] = str(ceil(error.retry_after_s))
+    return answer

@@ -20,13 +20,13 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
-from app.errors import Conflict, IsodynError, NotFound
+from app.errors import Conflict, IsodynError, NotFound, Overloaded
 from app.services.reach import Reach
 from app.viewer.asked import Marks, Shown, Target
 from app.viewer.chosen import choose
 from app.viewer.client_scene import ClientScene
 from app.viewer.content import OrganisationContent
-from app.viewer.proxy import CLOSE_SIGNED_OUT, PAGE_POLICY, ViserPage, fetch_page, relay
+from app.viewer.proxy import CLOSE_FULL, CLOSE_SIGNED_OUT, PAGE_POLICY, ViserPage, fetch_page, relay
 from app.viewer.requests import SECURITY_HEADERS, problem, read_json, refusal, same_origin
 from app.viewer.sessions import Session, SignedIn
 from app.viewer.viser_pool import ViserPool
@@ -70,6 +70,8 @@ class SceneEndpoints:
             return RedirectResponse(request.url.path, HTTPStatus.SEE_OTHER, SECURITY_HEADERS)
         try:
             page = await self._ready(session.reach)
+        except Overloaded as error:
+            return problem(error)
         except httpx.TransportError:
             return refusal(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting again; load this page once more")
         return _page_response(page, request)
@@ -82,11 +84,12 @@ class SceneEndpoints:
 
     def _arrived(self, task: asyncio.Task[ViserPage]) -> None:
         self._expected.discard(task)
-        if not task.cancelled() and task.exception() is not None:
+        if not task.cancelled() and not isinstance(task.exception(), Overloaded | None):  # its frame says so
             _log.warning("the viewer could not be made ready", exc_info=task.exception())
 
     async def _ready(self, reach: Reach) -> ViserPage:
-        """The organisation's server started, and viser's page, which is the same for all. Raises TransportError."""
+        """The organisation's server started, and viser's page, which is the same for all. Raises TransportError,
+        Overloaded."""
         async with self._pool.visit(reach) as viewer:
             try:
                 if self._page is None:
@@ -101,7 +104,8 @@ class SceneEndpoints:
         await asyncio.gather(*self._expected, return_exceptions=True)
 
     async def _connect(self, websocket: WebSocket) -> None:
-        """The canvas's WebSocket: foreign origins get 403 and nothing else; no session, a close with 4401."""
+        """The canvas's WebSocket: foreign origins get 403 and nothing else; no session, a close with 4401; no room, one
+        with 1013."""
         if not same_origin(websocket.headers):
             await websocket.close()  # before accepting: the handshake is answered with 403
             return
@@ -117,6 +121,9 @@ class SceneEndpoints:
                 reached = await relay(websocket, viewer.websocket_url(view), ended)
             if not reached:
                 await self._pool.discard(session.reach, viewer)
+        except Overloaded:
+            await websocket.accept()
+            await websocket.close(CLOSE_FULL, "too many 3-D views are open; try again in a minute")
         finally:
             ended.cancel()
 
@@ -155,7 +162,8 @@ class SceneEndpoints:
     async def _scene(
         self, request: Request, make_ready: Callable[[OrganisationContent], object] | None = None
     ) -> AsyncIterator[ClientScene]:
-        """The scene of the request's view, waiting for its canvas to connect. Raises NotFound, Conflict."""
+        """The scene of the request's view, waiting for its canvas to connect. Raises NotFound, Conflict,
+        Overloaded."""
         session = await self._session(request)
         view = None if session is None else _view(request.path_params["view"], session)
         if session is None or view is None:

@@ -1,5 +1,6 @@
 """One viser server per organisation, started by its first visitor and stopped when nobody has looked for a while; keys
-that are limited to the same buildings share one of their own.
+that are limited to the same buildings share one of their own. There are so many at one time: for another, the one that
+nobody has looked at for longest is stopped before its time.
 
 Isolation is by construction: a server is made with the content within that reach only. Nothing is put
 into a server's shared scene; a connection that does not bring the server's secret in its path (any other program on
@@ -22,6 +23,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 import numpy as np
 from starlette.concurrency import run_in_threadpool
 
+from app.errors import Overloaded
 from app.services.reach import Reach
 from app.viewer.client_scene import ClientScene
 from app.viewer.content import OrganisationContent, RecentlyUsed
@@ -36,6 +38,7 @@ __all__ = ["OrganisationViewer", "ViserPool"]
 
 _log = logging.getLogger(__name__)
 _RECENT_BYTES = 384 * 2**20
+_MOST_SERVERS = 100  # each has a thread, a port and what its scenes hold
 _MOST_LEFT = 50  # of the views that nobody looks at any more, in case somebody comes back
 
 
@@ -118,10 +121,12 @@ class ViserPool:
 
     @contextlib.asynccontextmanager
     async def visit(self, reach: Reach) -> AsyncIterator[OrganisationViewer]:
-        """The organisation's server, started if need be, and kept while the visit lasts."""
+        """The organisation's server, started if need be, and kept while the visit lasts. Raises Overloaded when there
+        are as many as there may be, and somebody looks at each."""
         async with self._lock:
             viewer = self._viewers.get(reach)
             if viewer is None:
+                await self._make_room()
                 viewer = await run_in_threadpool(self._start, reach)
                 self._viewers[reach] = viewer
             if self._sweeper is None:
@@ -148,6 +153,17 @@ class ViserPool:
                 if viewer.visitors == 0 and now - viewer.idle_since >= self._idle_seconds:
                     del self._viewers[reach]
                     await run_in_threadpool(stop_viser, viewer.server)
+
+    async def _make_room(self) -> None:
+        """Stop the server that nobody has looked at for longest, where one more would be too many."""
+        if len(self._viewers) < _MOST_SERVERS:
+            return
+        idle = [reach for reach, viewer in self._viewers.items() if viewer.visitors == 0]
+        if not idle:
+            reason = f"{_MOST_SERVERS} 3-D views of others are open, the most at one time; try again in a minute"
+            raise Overloaded(reason, retry_after_s=60.0)
+        longest = min(idle, key=lambda reach: self._viewers[reach].idle_since)
+        await run_in_threadpool(stop_viser, self._viewers.pop(longest).server)
 
     async def close(self) -> None:
         """Stop everything."""

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from starlette.testclient import WebSocketDenialResponse
 
+from app.errors import Overloaded
+
 ADMIN = "isd_admin-of-the-first-organisation"
 LOGGER = "app.api.access_log"
 MADE = re.compile(r"[0-9a-f]{32}")
@@ -45,6 +47,17 @@ def test_a_fault_of_ours_names_its_request_and_is_an_error(service: Any, lines: 
     assert answer.status_code == 500
     assert answer.json()["request_id"] == answer.headers["X-Request-ID"] == "asked"
     assert [(line.levelname, line.status) for line in lines()] == [("ERROR", 500)]
+
+
+def test_a_busy_server_warns(service: Any, lines: Any, monkeypatch: Any) -> None:
+    """Nothing failed, and nobody is to be woken for each of many."""
+
+    def refuse(*_: object) -> None:
+        raise Overloaded("busy")
+
+    monkeypatch.setattr("app.api.buildings.list_page", refuse)
+    assert service.http.get("/v1/buildings").status_code == 503
+    assert [(line.levelname, line.status) for line in lines()] == [("WARNING", 503)]
 
 
 def test_a_line_has_the_template_and_who_asked(service: Any, building: str, lines: Any) -> None:

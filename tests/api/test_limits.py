@@ -20,7 +20,7 @@ from app.api.auth import recognised
 from app.api.body import BodyLimit, upload
 from app.api.context import Context
 from app.api.key_limits import KeyLimits
-from app.db.tables import Floor, Key, Survey
+from app.db.tables import Building, Floor, Key, Survey
 from app.errors import Overloaded, QuotaExceeded, TooMany
 from app.main import create_app, first_start
 from app.services.manage_keys import create_key
@@ -29,6 +29,7 @@ from tests.api.conftest import make_walk_csv
 from tests.services.test_file_readers import large_parquet
 
 ADMIN, OTHER = "isd_the-admin-of-limits", "isd_another-key-of-it"
+ELSEWHERE = "isd_a-key-of-another-organisation"
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +270,7 @@ def test_bodies_share_so_much_memory_and_give_it_back() -> None:
 
     async def scenario() -> list[int]:
         statuses = [(await exchange(limit, [part(150_000)]))[0]["status"]]
-        async with memory.room(100_000):
+        async with memory.room(100_000, "a"):
             statuses.append((await exchange(limit, [part(80_000, True), part(80_000)]))[0]["status"])
             statuses.append((await exchange(limit, [part(1000)]))[0]["status"])
         statuses.append((await exchange(limit, [part(150_000)]))[0]["status"])
@@ -290,11 +291,11 @@ def test_a_packed_file_that_does_not_say_so_takes_the_memory_of_what_it_unpacks_
         def request() -> Request:
             return Request({"type": "http", "method": "POST", "path": "/", "headers": told}, receive)
 
-        async with memory.room(60_000):
+        async with memory.room(60_000, "other"):
             with pytest.raises(Overloaded):
-                async with upload(request(), 50_000, memory):
+                async with upload(request(), 50_000, memory, "a"):
                     pass
-        async with upload(request(), 50_000, memory) as data:
+        async with upload(request(), 50_000, memory, "a") as data:
             assert data == bytes(50_000)
             with pytest.raises(Overloaded):
                 memory.take(50_001)
@@ -309,7 +310,7 @@ def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
         order: list[str] = []
 
         async def upload(name: str, size: int) -> None:
-            async with memory.room(size):
+            async with memory.room(size, name):
                 order.append(name)
                 await asyncio.sleep(0.01)
 
@@ -320,14 +321,45 @@ def test_an_upload_waits_for_room_in_turn_and_not_for_ever() -> None:
         cancelled.cancel()
         await asyncio.gather(*tasks)
         assert order == ["a", "b", "c"], "a small one does not overtake"
-        async with memory.room(10**9):
+        async with memory.room(10**9, "d"):
             hasty = BodyMemory(100, 0.01)
-            async with hasty.room(60):
+            async with hasty.room(60, "a"):
                 with pytest.raises(Overloaded):
-                    async with hasty.room(60):
+                    async with hasty.room(60, "b"):
                         pass
-                async with hasty.room(40):
+                async with hasty.room(40, "c"):
                     pass
+
+    asyncio.run(scenario())
+
+
+def test_uploads_of_one_organisation_leave_room_for_others() -> None:
+    """Its own wait for each other, and nobody else waits for those."""
+
+    async def scenario() -> None:
+        memory, enough, order = BodyMemory(100, 0.2), asyncio.Event(), []
+
+        async def hold(count: int, organisation_id: str) -> None:
+            async with memory.room(count, organisation_id):
+                order.append(organisation_id)
+                await enough.wait()
+
+        first = [asyncio.create_task(hold(20, "slow")) for _ in range(2)]
+        third = asyncio.create_task(hold(20, "slow"))
+        others = [asyncio.create_task(hold(30, organisation_id)) for organisation_id in ("a", "b")]
+        with pytest.raises(TooMany, match="this organisation's uploads") as refused:
+            await third
+        assert refused.value.retry_after_s is not None
+        assert order == ["slow", "slow", "a", "b"]
+        with pytest.raises(Overloaded):
+            await hold(30, "c")
+        later = asyncio.create_task(hold(20, "slow"))
+        await asyncio.sleep(0)
+        enough.set()
+        await asyncio.gather(*first, *others, later)
+        async with memory.room(90, "slow"):
+            assert order[4:] == ["slow"], "one that is alone may take more than half"
+        memory.take(100)
 
     asyncio.run(scenario())
 
@@ -359,7 +391,7 @@ def test_bodies_that_do_not_come_keep_nobody_out(tmp_path: Path) -> None:
         held = [asyncio.create_task(ask("POST", "/v1/buildings", body=[unfinished])) for _ in range(most)]
         await asyncio.sleep(0)
         assert await ask("GET", "/v1/buildings", ADMIN) == 200
-        async with application.state.context.bodies.room(settings.max_upload_bytes):
+        async with application.state.context.bodies.room(settings.max_upload_bytes, "a"):
             pass
         for each in held:
             each.cancel()
@@ -445,6 +477,31 @@ def test_an_upload_that_would_wait_too_long_is_refused_before_it_is_read(
     finally:
         enough.set()
     assert all(each.result() for each in held)
+
+
+def test_an_organisation_that_holds_its_share_of_uploads_is_told_so_and_another_is_served(
+    context: tuple[Context, TestClient], http: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, _ = context
+    monkeypatch.setattr(made.bodies, "_longest_wait_s", 0.05)
+    with made.transaction() as session:
+        create_key(session, organisation="elsewhere", name="other", scopes=["admin"], secret=ELSEWHERE)
+    here = http.get("/v1/buildings").json()["items"][0]["id"]
+    floor = http.get(f"/v1/buildings/{here}/floors").json()["items"][0]["id"]
+    other = {"Authorization": f"Bearer {ELSEWHERE}"}
+    there = http.post("/v1/buildings", json={"name": "A"}, headers=other).json()["id"]
+    theirs = http.post(f"/v1/buildings/{there}/floors", json={"name": "F", "ordinal": 0}, headers=other).json()["id"]
+    with made.transaction() as session:
+        organisation_id = session.get_one(Building, here).organisation_id
+    half = made.settings.body_memory_bytes * 3 // 8
+    assert http.portal is not None
+    with http.portal.wrap_async_context_manager(made.bodies.room(half, organisation_id)):
+        refused = http.post(f"/v1/floors/{floor}/surveys", content=b"no survey")
+        assert refused.status_code == 429
+        assert refused.json()["type"].endswith("/too-many")
+        assert refused.headers["Retry-After"] == "2"
+        answer = http.post(f"/v1/floors/{theirs}/surveys", content=b"no survey", headers=other)
+        assert answer.status_code == 422, answer.text
 
 
 def test_a_database_that_is_away_keeps_no_server_from_stopping(tmp_path: Path) -> None:

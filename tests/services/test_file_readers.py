@@ -4,6 +4,7 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,11 +22,11 @@ from PIL import Image
 from pyarrow import parquet
 
 from app.calibration.sensor_model import SensorModel
-from app.errors import CorruptArtefact, InvalidInput, IsodynError, TooLarge, UnreadableSurvey
+from app.errors import CorruptArtefact, InvalidInput, IsodynError, TooLarge, Unavailable, UnreadableSurvey
 from app.services.artefacts import pack, samples_to_bytes
 from app.services.file_messages import answer_to_bytes, told
 from app.services.file_orders import PictureOrder, SurveyOrder, carry_out
-from app.services.file_readers import FileReaders
+from app.services.file_readers import FileReaders, _Program
 from app.services.receive_plan import Picture
 from app.survey.walk import Walk
 from tests.survey.conftest import as_csv, as_ndjson, as_parquet, make_walk
@@ -167,17 +168,78 @@ def test_a_file_that_takes_too_long_is_refused_and_the_next_is_read() -> None:
 
 
 def test_a_reader_that_dies_takes_only_its_file_with_it(readers: FileReaders) -> None:
+    """A crash is the file's fault; what the kernel kills for lack of memory is not."""
     readers.start()
     (program,) = programs()
     slow, quick = as_ndjson(columns(50_000)), SurveyOrder(FILES["csv"], "csv", "building", 0.0)
     with ThreadPoolExecutor(2) as threads:
-        reading = threads.submit(readers.survey, SurveyOrder(slow, "ndjson", "building", 0.0))
-        os.kill(until(lambda: children_of(program))[0], signal.SIGSEGV)
-        assert len(readers.survey(quick).samples) == 40
-        with pytest.raises(UnreadableSurvey, match="ended the process that read it"):
-            reading.result()
+        for ended_by, refused, why in (
+            (signal.SIGSEGV, UnreadableSurvey, "ended the process that read it"),
+            (signal.SIGKILL, Unavailable, "for lack of memory perhaps; send it again"),
+        ):
+            reading = threads.submit(readers.survey, SurveyOrder(slow, "ndjson", "building", 0.0))
+            os.kill(until(lambda: children_of(program))[0], ended_by)
+            assert len(readers.survey(quick).samples) == 40
+            with pytest.raises(refused, match=why):
+                reading.result()
+            until(lambda: not children_of(program))
         os.kill(program, signal.SIGKILL)
         assert len(threads.submit(readers.survey, quick).result().samples) == 40, "the program is started again"
+
+
+@pytest.mark.slow
+def test_where_no_process_can_be_started_no_file_is_to_blame(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An operating system that has no more of them, while a file is being read."""
+    full, there = tmp_path / "full", programs()
+    (tmp_path / "sitecustomize.py").write_text(
+        "import errno, os\nfork = os.fork\n"
+        "def of_a_full_system():\n"
+        f"    if os.path.exists({str(full)!r}):\n"
+        "        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))\n"
+        "    return fork()\n"
+        "os.fork = of_a_full_system\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path.cwd()}")
+    made, quick = FileReaders(2, 2 * GIB, 60.0), SurveyOrder(FILES["csv"], "csv", "building", 0.0)
+    try:
+        with monkeypatch.context() as no_python:
+            no_python.setattr(sys, "executable", str(tmp_path / "nowhere"))
+            with pytest.raises(Unavailable, match="cannot be started now"):
+                made.start()
+        made.start()
+        (program,) = set(programs()) - set(there)
+        with ThreadPoolExecutor(1) as threads:
+            slow = SurveyOrder(as_ndjson(columns(20_000)), "ndjson", "building", 0.0)
+            reading = threads.submit(made.survey, slow)
+            until(lambda: children_of(program))
+            full.touch()
+            with pytest.raises(Unavailable, match="Resource temporarily unavailable; send it again"):
+                made.survey(quick)
+            full.unlink()
+            assert len(made.survey(quick).samples) == 40
+            assert len(reading.result().samples) == 20_000, "it read on"
+        assert set(programs()) - set(there) == {program}
+    finally:
+        made.close()
+
+
+@pytest.mark.slow
+def test_an_answer_that_comes_too_late_is_taken_for_no_other() -> None:
+    program = _Program()
+    try:
+        pid = program._process.pid
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            child = program.fork(theirs, 10, GIB)
+            program._control.settimeout(0.1)
+            os.kill(pid, signal.SIGSTOP)
+            assert program.end(child) == -signal.SIGKILL, "nobody knows how it ended"
+            os.kill(pid, signal.SIGCONT)
+            until(lambda: not command(child))
+            with pytest.raises(OSError, match="descriptor"):
+                program.fork(theirs, 10, GIB)
+    finally:
+        program.close()
 
 
 def command(pid: int) -> bytes:

@@ -110,6 +110,27 @@ def test_work_is_not_done_for_a_client_that_has_gone(turns: Turns) -> None:
     assert done == []
 
 
+def test_no_thread_waits_for_an_event_loop_that_has_stopped(turns: Turns, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would wait for ever, and with it the process that is to end."""
+    monkeypatch.setattr("app.services.turns._TOLD_WITHIN_S", 0.1)
+    enough, loop = Event(), asyncio.new_event_loop()
+
+    async def gone() -> bool:
+        return False
+
+    try:
+        turns.submit(enough.wait, 60)
+        waiting = loop.create_task(turns.run(lambda: "done", gone))
+        loop.run_until_complete(asyncio.sleep(0.1))
+        enough.set()
+        assert turns.submit(lambda: "next").result(10) == "next"
+        with pytest.raises(Overloaded, match="stopping"):
+            loop.run_until_complete(waiting)
+    finally:
+        loop.run_until_complete(loop.shutdown_default_executor())
+        loop.close()
+
+
 def test_a_fault_in_the_work_is_the_callers(turns: Turns) -> None:
     with pytest.raises(ZeroDivisionError):
         asyncio.run(turns.run(lambda: 1 // 0))

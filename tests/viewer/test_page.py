@@ -3,15 +3,25 @@
 import io
 import socket
 import sys
+import time
 from pathlib import Path
 from subprocess import run
 
 import numpy as np
 import pytest
 from PIL import Image
+from websockets.exceptions import ConnectionClosed
 
 from app.services.reach import Reach
 from app.viewer.page import COOKIE, ViewerApp
+from app.viewer.proxy import CLOSE_FULL
+
+
+def until(true, patience_s=20.0):
+    give_up = time.monotonic() + patience_s
+    while not true():
+        assert time.monotonic() < give_up
+        time.sleep(0.01)
 
 
 def test_a_stranger_is_shown_the_sign_in_page_and_nothing_else(running):
@@ -154,6 +164,41 @@ def test_a_key_limited_to_a_building_has_a_page_and_a_server_of_its_own(running)
         poster = client.get("/view/poster.png?floor=floor-0", headers=cookie)
         assert poster.status_code == 204, "there is no map in the barn, and the tower's is not shown"
     assert set(running.viewer.pool.running()) == {Reach("north"), Reach("north", frozenset({"barn"}))}
+
+
+def test_so_many_servers_run_and_the_one_unused_for_longest_makes_room(running, open_page, monkeypatch):
+    monkeypatch.setattr("app.viewer.viser_pool._MOST_SERVERS", 2)
+    north, barn, south = (running.cookie(key) for key in ("north-key", "barn-key", "south-key"))
+    reaches = {"north": Reach("north"), "barn": Reach("north", frozenset({"barn"})), "south": Reach("south")}
+
+    def look(cookie):
+        with running.client() as client:
+            return client.get("/view/scene/view-0001", headers={"Cookie": cookie})
+
+    def are_running(*names):
+        return set(running.viewer.pool.running()) == {reaches[name] for name in names}
+
+    def nobody_looks():
+        return not any(viewer.visitors for viewer in running.viewer.pool.running().values())
+
+    until(nobody_looks)  # what signing in began is done
+    assert [look(cookie).status_code for cookie in (north, barn, north, south)] == [200] * 4
+    assert are_running("north", "south")
+    with running.websocket(north) as looking, running.websocket(south) as also:
+        open_page(looking)
+        open_page(also)
+        refused = look(barn)
+        assert refused.status_code == 503
+        assert refused.headers["Retry-After"] == "60"
+        assert "2 3-D views" in refused.json()["detail"]
+        assert running.ask(barn, "show").status_code == 503
+        with running.websocket(barn) as socket, pytest.raises(ConnectionClosed) as closed:
+            socket.recv(timeout=5)
+        assert closed.value.rcvd.code == CLOSE_FULL
+        assert are_running("north", "south"), "nobody who looks is disturbed"
+        assert looking.ping().wait(5)
+    until(nobody_looks)
+    assert look(barn).status_code == 200
 
 
 def test_signing_out_makes_the_cookie_worthless(running):
