@@ -16,6 +16,7 @@ from app.jobs.admission import HIGH, LOW, NORMAL
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from workers.builder import DEFAULT_BUILDER, load_builder
 from workers.reconcile import close_abandoned_jobs
+from workers.slots import Slots
 from workers.workflows import WorkflowContext
 
 if TYPE_CHECKING:
@@ -176,7 +177,7 @@ def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(
     client = open_client(engine)
     client.cancel_workflow(site.job(given_up).workflow_id)
     builder = load_builder(DEFAULT_BUILDER)
-    close_abandoned_jobs(client, WorkflowContext(sessions, site.queue, "", builder, DEFAULT_BUILDER))
+    close_abandoned_jobs(client, WorkflowContext(sessions, site.queue, "", builder, DEFAULT_BUILDER, Slots(1)))
     client.destroy()
     assert site.job(given_up).status == "failed"
     admit(site)
