@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from typing import IO, Any
 
 from app.errors import Unavailable
@@ -44,13 +43,7 @@ class FitProcesses:
 
     def __init__(self) -> None:
         self._idle: list[subprocess.Popen[bytes]] = []
-        self._running = 0
         self._lock = threading.Lock()
-
-    @property
-    def running(self) -> int:
-        """How many fits run at this moment."""
-        return self._running
 
     def run(
         self,
@@ -69,15 +62,14 @@ class FitProcesses:
         the child could not reach its blobs.
         """
         order = {"builder": builder, **work, "blob_url": blob_url, "facts": dict(facts()), "trace": traceparent()}
-        with self._counted():
-            child = self._take()
-            try:
-                _tell(child, json.dumps(order))
-                said = _listen(child, report, board, silence_s)
-            except BaseException:
-                _stop(child)
-                raise
-            self._put_back(child, said["kept"])
+        child = self._take()
+        try:
+            _tell(child, json.dumps(order))
+            said = _listen(child, report, board, silence_s)
+        except BaseException:
+            _stop(child)
+            raise
+        self._put_back(child, said["kept"])
         result: Result = said["result"]
         return result
 
@@ -85,16 +77,6 @@ class FitProcesses:
         """End the children that wait."""
         while (child := self._pop()) is not None:
             _end(child)
-
-    @contextmanager
-    def _counted(self) -> Iterator[None]:
-        with self._lock:
-            self._running += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._running -= 1
 
     def _take(self) -> subprocess.Popen[bytes]:
         while (child := self._pop()) is not None:

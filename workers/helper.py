@@ -25,11 +25,10 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Helper:
-    """`slots`: fits that this worker runs at one time, jobs and chunks together."""
+    """One of a worker."""
 
     context: WorkflowContext
     worker_id: str
-    slots: int
     _fits: FitProcesses = field(default_factory=FitProcesses)
     _helping: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -47,7 +46,7 @@ class Helper:
 
     def _reserve(self) -> bool:
         with self._lock:
-            free = self.context.fits.running + self._helping < self.slots
+            free = self._helping < self.context.slots.free
             self._helping += free
             return free
 
@@ -69,8 +68,8 @@ class Helper:
         try:
             while following is not None:
                 self._fit(following)
-                busy = self.context.fits.running + self._helping > self.slots
-                following = None if busy or stop.is_set() else self._take()
+                wanted = self._helping > self.context.slots.free
+                following = None if wanted or stop.is_set() else self._take()
         finally:
             self._free()
 

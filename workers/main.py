@@ -28,8 +28,9 @@ from app.settings import Settings
 from workers.builder import DEFAULT_BUILDER, load_builder
 from workers.helper import Helper
 from workers.lifeline import Lifeline, new_worker_id
-from workers.reaper import IDLE_POLL_S, Reaper
+from workers.reaper import Reaper
 from workers.reconcile import has_unfinished_jobs
+from workers.slots import POLL_S, Slots
 from workers.upkeep import Upkeep
 from workers.workflows import WorkflowContext, register_workflows
 
@@ -63,19 +64,21 @@ def run_worker(
     engine = create_database_engine(url)
     client = open_client(engine)
     context = WorkflowContext(
-        session_factory(engine), JobQueue(engine), settings.resolved_blob_url, load_builder(builder), builder
-    )
+        session_factory(engine), JobQueue(engine), settings.resolved_blob_url, load_builder(builder), builder,
+        Slots(settings.worker_processes),
+    )  # fmt: skip
     register_workflows(context)
     lease = Lease(engine, new_worker_id(), lease_ttl_s, slots=settings.worker_processes)
     lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)
-    _launch(engine, lease.worker_id, settings.worker_processes)
+    _launch(engine, lease.worker_id, settings.worker_processes, context.slots)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
-    _start_thread("helper", Helper(context, lease.worker_id, settings.worker_processes).run, stop)
+    _start_thread("helper", Helper(context, lease.worker_id).run, stop)
     upkeep = Upkeep(client, context.sessions, settings.job_history_days, settings.track_history_days)
     _start_thread("upkeep", upkeep.run, stop)
     parent_died = _wait(stop, parent_pid)
+    context.slots.close()
     _leave(lease, client, 0.0 if parent_died else drain_s)
     context.fits.close()
     lifeline.release()
@@ -97,13 +100,15 @@ def _start_thread(name: str, target: Callable[..., None], *arguments: object) ->
     threading.Thread(target=target, args=arguments, name=name, daemon=True).start()
 
 
-def _launch(engine: Engine, worker_id: str, fits_at_one_time: int) -> None:
-    DBOS(config=engine_configuration(engine.url, worker_id))
+def _launch(engine: Engine, worker_id: str, fits_at_one_time: int, slots: Slots) -> None:
+    job_engine = DBOS(config=engine_configuration(engine.url, worker_id))
+    DBOS.listen_queues([])  # our slots do
     DBOS.launch()
     # The queue's row is shared: of workers set differently, the one that started last decides for all.
-    DBOS.register_queue(
-        QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=IDLE_POLL_S
+    queue = DBOS.register_queue(
+        QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=POLL_S
     )
+    slots.fill(job_engine, queue)
 
 
 def _end_when_lost(lease: Lease) -> None:

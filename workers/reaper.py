@@ -9,7 +9,6 @@ from dbos import DBOSClient
 from sqlalchemy import select
 
 from app.db.tables import Job
-from app.jobs.engine import QUEUE
 from app.jobs.lease import Lease
 from app.telemetry.metrics import WORKERS_TAKEN_OVER
 from workers.janitor import hand_over
@@ -17,10 +16,9 @@ from workers.lifeline import Lifeline
 from workers.reconcile import LostJobs, close_abandoned_jobs, has_unfinished_jobs
 from workers.workflows import WorkflowContext
 
-__all__ = ["IDLE_POLL_S", "Reaper"]
+__all__ = ["Reaper"]
 
 LOOK_EVERY_S = 5.0
-IDLE_POLL_S, BUSY_POLL_S = 0.25, 0.1
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +42,6 @@ class Reaper:
                 close_abandoned_jobs(self.client, self.context)
                 self.lost.look(self.client, self.context)
                 self._admit_the_waiting()
-                self._set_pace()
             except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied
                 log.exception("could not look after dead workers; trying again")
             if stop.wait(min(self.lease.ttl_s / 4, LOOK_EVERY_S)):
@@ -60,15 +57,6 @@ class Reaper:
             self.lease.bury(dead_id)
         for dead_id in cut:
             self.lifeline.bury(dead_id)
-
-    def _set_pace(self) -> None:
-        """Poll the queue often while there are jobs in hand, and seldom when idle: polling costs."""
-        in_hand = select(Job.id).where(Job.status == "running").limit(1)
-        with self.context.sessions() as session:
-            wanted_s = BUSY_POLL_S if session.scalar(in_hand) is not None else IDLE_POLL_S
-        queue = self.client.retrieve_queue(QUEUE)
-        if queue is not None and queue.polling_interval_sec != wanted_s:
-            queue.set_polling_interval_sec(wanted_s)
 
     def _admit_the_waiting(self) -> None:
         """For the case that nobody adds or ends a job: workers start, and workers die."""

@@ -29,6 +29,7 @@ from app.telemetry.metrics import JOB_STEP_SECONDS, JOBS_ENDED
 from app.telemetry.tracing import link_to
 from workers.builder import Builder, Plan, Result
 from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
+from workers.slots import Slots
 
 __all__ = ["WorkflowContext", "register_workflows"]
 
@@ -54,6 +55,7 @@ class WorkflowContext:
     blob_url: str
     builder: Builder
     builder_name: str
+    slots: Slots
     fits: FitProcesses = field(default_factory=FitProcesses)
 
 
@@ -87,13 +89,13 @@ def register_workflows(context: WorkflowContext) -> None:
     @DBOS.workflow(name=REBUILD, max_recovery_attempts=MOST_RECOVERIES)
     def rebuild(floor_id: str, generation: int) -> str:
         workflow_id = f"{REBUILD}:{floor_id}:{generation}"
-        with with_facts(workflow_id=workflow_id):
+        with with_facts(workflow_id=workflow_id), context.slots.taken():
             return run(workflow_id, generation)
 
     @DBOS.workflow(name=BUILD, max_recovery_attempts=MOST_RECOVERIES)
     def build(map_id: str) -> str:
         workflow_id = f"{BUILD}:{map_id}"
-        with with_facts(workflow_id=workflow_id):
+        with with_facts(workflow_id=workflow_id), context.slots.taken():
             return run(workflow_id, 0)
 
 

@@ -17,6 +17,7 @@ from app.jobs.admission import HIGH, LOW, NORMAL
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from workers.builder import DEFAULT_BUILDER, load_builder
 from workers.reconcile import LostJobs, close_abandoned_jobs
+from workers.slots import Slots
 from workers.workflows import WorkflowContext
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def test_without_a_worker_jobs_wait_in_our_table_only(site: "Site", hire: Hire, 
 
 def context_of(site: "Site") -> WorkflowContext:
     """What the reaper of a worker works with."""
-    return WorkflowContext(site.sessions, site.queue, "", load_builder(DEFAULT_BUILDER), DEFAULT_BUILDER)
+    return WorkflowContext(site.sessions, site.queue, "", load_builder(DEFAULT_BUILDER), DEFAULT_BUILDER, Slots(1))
 
 
 def ended() -> float:

@@ -24,7 +24,8 @@ def job_id(site: "Site", floor: Floor) -> str:
 @pytest.mark.parametrize(("fraction", "progress"), [(0.0, 0), (0.256, 26), (1.0, 100), (7.0, 100), (-1.0, 0)])
 def test_a_report_is_in_the_row(site: "Site", job_id: str, fraction: float, progress: int) -> None:
     asked: list[int] = []
-    JobReporter(site.sessions, job_id, still_owner=asked.append).report(fraction, "tile 3 of 12")
+    reporter = JobReporter(site.sessions, job_id, still_owner=asked.append, owner_interval_s=0.0)
+    reporter.report(fraction, "tile 3 of 12")
     job = site.job(job_id)
     assert (job.progress, job.message) == (progress, "tile 3 of 12")
     assert asked == [progress]
@@ -58,5 +59,14 @@ def test_who_is_not_the_owner_writes_nothing(site: "Site", job_id: str) -> None:
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        JobReporter(site.sessions, job_id, still_owner=refuse).report(0.5, "from a zombie")
+        JobReporter(site.sessions, job_id, still_owner=refuse, owner_interval_s=0.0).report(0.5, "from a zombie")
     assert site.job(job_id).progress == 0
+
+
+def test_the_owner_is_not_asked_for_at_every_report(site: "Site", job_id: str) -> None:
+    asked: list[int] = []
+    reporter = JobReporter(site.sessions, job_id, still_owner=asked.append, interval_s=0.0, owner_interval_s=60.0)
+    for percent in (10, 20):
+        reporter.report(percent / 100, "on the way")
+    assert site.job(job_id).progress == 20
+    assert asked == []
