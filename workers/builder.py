@@ -27,10 +27,12 @@ class Builder(Protocol):
         """Mark the job running and fix what it builds."""
         ...
 
-    def fit_build(self, plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None], board: "Board") -> Result:
+    def fit_build(
+        self, plan: Plan, blobs: BlobStore, progress: Callable[[float, str], None], board: "Board | None"
+    ) -> Result:
         """Compute, in a process of its own. `progress(fraction, message)` raises JobCancelled.
 
-        Large work may be offered to other workers on the `board`.
+        Large work may be offered to other workers on the `board`, where there are any.
         """
         ...
 

@@ -1,8 +1,9 @@
 """The child of `workers.fit_process`: takes orders for fits, one after the other, and answers them.
 
-A line of JSON on standard input is an order, or tells who took which of the tiles the fit offered; the word `cancel` is
-for the fit that runs. Answers are lines of JSON on standard output: progress, tiles offered to others, and at the end a
-result or an error, with whether another order may come. A parent that dies closes the pipe, and the child ends.
+A line of JSON on standard input is an order, or what others took of the tiles that the fit offered, which it asks for;
+the word `cancel` is for the fit that runs. Answers are lines of JSON on standard output: progress, what is offered to
+others, and at the end a result or an error, with whether another order may come. A parent that dies closes the pipe,
+and the child ends.
 """
 
 import json
@@ -13,6 +14,7 @@ import resource
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -30,6 +32,7 @@ from workers.builder import load_builder
 __all__: list[str] = []
 
 ORPHANED = 4
+LOOK_EVERY_S = 0.25
 IDLE_S = 60.0  # then its memory is given back
 LARGEST_KEPT_KIB = 768 * 1024  # of its highest memory use: an allocator seldom gives back what a large fit took
 
@@ -41,7 +44,7 @@ class _Orders:
 
     def __init__(self) -> None:
         self.cancelled = threading.Event()
-        self.taken: dict[str, Any] = {}
+        self.taken: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._waiting: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         threading.Thread(target=self._hear, daemon=True).start()
 
@@ -61,29 +64,40 @@ class _Orders:
                 continue
             said = json.loads(line)
             if "taken" in said:
-                self.taken = said
+                self.taken.put(said)
             else:
                 self._waiting.put(said)
         os._exit(ORPHANED)
 
 
 class _Board:
-    """Where a fit offers its tiles to other workers (`app.services.shared_tiles.Board`): the parent has it."""
+    """Where a fit offers its tiles to other workers (`app.services.shared_tiles.Board`): the parent has it.
+
+    It is asked for news now and then, and once at a time: what it writes is read, however busy the fit is.
+    """
 
     def __init__(self, say: Callable[[dict[str, Any]], None], orders: _Orders) -> None:
         self._say, self._orders = say, orders
-        self._order_sha256 = ""
+        self._offers, self._taken = 0, dict[int, str | None]()
+        self._asked, self._ask_s = False, 0.0
 
     def offer(self, order_sha256: str, chunks: int) -> None:
-        self._order_sha256 = order_sha256
+        self._offers, self._taken, self._asked = self._offers + 1, {}, False
         self._say({"offer": {"order_sha256": order_sha256, "chunks": chunks}})
 
     def begin(self, chunk: int) -> None:
         self._say({"begin": chunk})
 
     def taken(self) -> Mapping[int, str | None]:
-        said = self._orders.taken
-        return dict(said["taken"]) if said.get("order_sha256") == self._order_sha256 else {}
+        with suppress(queue.Empty):
+            while said := self._orders.taken.get_nowait():
+                if said["offer"] == self._offers:  # and not of one before
+                    self._taken |= dict(said["taken"])
+                    self._asked = False
+        if not self._asked and time.monotonic() > self._ask_s:
+            self._asked, self._ask_s = True, time.monotonic() + LOOK_EVERY_S
+            self._say({"look": self._offers})
+        return self._taken
 
     def withdraw(self) -> None:
         self._say({"withdraw": True})
@@ -110,11 +124,11 @@ def main() -> None:
             raise JobCancelled("the job was asked to stop")
         say({"fraction": fraction, "message": message})
 
-    kept = True
+    board, kept = _Board(say, orders), True
     while kept and (order := orders.next()) is not None:
         attach(traced_from(order.get("trace")))
         with with_facts(**order.get("facts", {})):  # what it logs and traces belongs to the job that it works for
-            answer = _answer(order, progress, _Board(say, orders))
+            answer = _answer(order, progress, board)
         kept = "result" in answer and _highest_memory_kib() < LARGEST_KEPT_KIB
         say(answer | {"kept": kept})
     answers.close()
@@ -128,7 +142,8 @@ def _highest_memory_kib() -> int:
         for line in status:
             if line.startswith("VmHWM:"):
                 return int(line.split()[1])
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    highest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return highest // 1024 if sys.platform == "darwin" else highest
 
 
 def _answer(order: dict[str, Any], progress: Progress, board: _Board) -> dict[str, Any]:
@@ -142,7 +157,8 @@ def _answer(order: dict[str, Any], progress: Progress, board: _Board) -> dict[st
             blobs = open_blob_store(order["blob_url"], make=False)
             if "chunk" in order:
                 return {"result": builder.fit_chunk(**order["chunk"], blobs=blobs, progress=progress)}
-            return {"result": builder.fit_build(order["plan"], blobs, progress, board)}
+            shared = board if order.get("shares") else None  # a parent of an older version would not understand
+            return {"result": builder.fit_build(order["plan"], blobs, progress, shared)}
     except Unavailable as error:
         logging.getLogger(__name__).warning("%s: %s", error, error.__cause__)
         return {"unavailable": str(error)}

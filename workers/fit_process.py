@@ -61,7 +61,8 @@ class FitProcesses:
         `board`: where the fit may offer its tiles to others. Raises FitFailed, FitProcessDied, and Unavailable where
         the child could not reach its blobs.
         """
-        order = {"builder": builder, **work, "blob_url": blob_url, "facts": dict(facts()), "trace": traceparent()}
+        order = {"builder": builder, **work, "blob_url": blob_url, "facts": dict(facts()), "trace": traceparent(),
+                 "shares": board is not None}  # fmt: skip
         child = self._take()
         try:
             _tell(child, json.dumps(order))
@@ -69,6 +70,9 @@ class FitProcesses:
         except BaseException:
             _stop(child)
             raise
+        finally:
+            if board is not None:
+                board.withdraw()
         self._put_back(child, said["kept"])
         result: Result = said["result"]
         return result
@@ -108,65 +112,48 @@ def _listen(
 ) -> dict[str, Any]:
     """What the child said last: its result."""
     fraction, message, heard = 0.0, "starting", time.monotonic()
-    offered = _Offered(child, board)
-    try:
-        for line in _lines_or_pauses(child):
-            offered.tell_who_took()
-            if line is None:
-                report(fraction, message)
-                if time.monotonic() - heard > silence_s:
-                    raise FitProcessDied(f"the fit made no progress for {silence_s:,.0f} s and was stopped")
-                continue
-            heard = time.monotonic()
-            said: dict[str, Any] = json.loads(line)
-            if "result" in said:
-                return said
-            if "unavailable" in said:
-                raise Unavailable(said["unavailable"])
-            if "error" in said:
-                raise FitFailed(said["error"])
-            if "fraction" in said:
-                fraction, message = said["fraction"], said["message"]
-                report(fraction, message)
-            else:
-                offered.hear(said)
-    finally:
-        offered.withdraw()
+    shared = None if board is None else _Shared(child, board)
+    for line in _lines_or_pauses(child):
+        if line is None:
+            report(fraction, message)
+            if time.monotonic() - heard > silence_s:
+                raise FitProcessDied(f"the fit made no progress for {silence_s:,.0f} s and was stopped")
+            continue
+        heard = time.monotonic()
+        said: dict[str, Any] = json.loads(line)
+        if "result" in said:
+            return said
+        if "unavailable" in said:
+            raise Unavailable(said["unavailable"])
+        if "error" in said:
+            raise FitFailed(said["error"])
+        if "fraction" in said:
+            fraction, message = said["fraction"], said["message"]
+            report(fraction, message)
+        elif shared is not None:
+            shared.hear(said)
     raise FitProcessDied(_epitaph(child))
 
 
-class _Offered:
-    """Between a child that shares its tiles and the board they are on."""
+class _Shared:
+    """Between a child that shares its tiles and the board they are on. What it is told it has asked for: it reads."""
 
-    def __init__(self, child: subprocess.Popen[bytes], board: ChunkBoard | None) -> None:
+    def __init__(self, child: subprocess.Popen[bytes], board: ChunkBoard) -> None:
         self._child, self._board = child, board
-        self._order_sha256: str | None = None
         self._told: Mapping[int, str | None] = {}
-        self._next_look_s = 0.0
 
     def hear(self, said: dict[str, Any]) -> None:
-        if self._board is None:
-            return
         if "offer" in said:
-            self._order_sha256, self._told = said["offer"]["order_sha256"], {}
+            self._told = {}
             self._board.offer(**said["offer"])
         elif "begin" in said:
             self._board.begin(said["begin"])
-        elif "withdraw" in said:
-            self.withdraw()
-
-    def tell_who_took(self) -> None:
-        if self._board is None or self._order_sha256 is None or time.monotonic() < self._next_look_s:
-            return
-        self._next_look_s = time.monotonic() + LOOK_EVERY_S
-        taken = self._board.taken()
-        if taken != self._told:
+        elif "look" in said:
+            taken = self._board.taken()
+            news = [each for each in taken.items() if each not in self._told.items()]
             self._told = taken
-            _tell(self._child, json.dumps({"order_sha256": self._order_sha256, "taken": list(taken.items())}))
-
-    def withdraw(self) -> None:
-        if self._board is not None and self._order_sha256 is not None:
-            self._order_sha256 = None
+            _tell(self._child, json.dumps({"taken": news, "offer": said["look"]}))
+        elif "withdraw" in said:
             self._board.withdraw()
 
 

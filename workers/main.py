@@ -60,7 +60,7 @@ def run_worker(
         start_http_server(settings.worker_metrics_port, settings.host)
     url = settings.resolved_database_url
     migrate(url)
-    open_blob_store(settings.resolved_blob_url)  # makes its folder: no fit does
+    blobs = open_blob_store(settings.resolved_blob_url)  # makes its folder: no fit does
     engine = create_database_engine(url)
     client = open_client(engine)
     context = WorkflowContext(
@@ -75,7 +75,7 @@ def run_worker(
     _launch(engine, lease.worker_id, settings.worker_processes, context.slots)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
     _start_thread("helper", Helper(context, lease.worker_id).run, stop)
-    upkeep = Upkeep(client, context.sessions, settings.job_history_days, settings.track_history_days)
+    upkeep = Upkeep(client, context.sessions, blobs, settings.job_history_days, settings.track_history_days)
     _start_thread("upkeep", upkeep.run, stop)
     parent_died = _wait(stop, parent_pid)
     context.slots.close()

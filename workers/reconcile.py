@@ -3,16 +3,18 @@ which it has no record."""
 
 import logging
 import time
+from contextlib import suppress
 from datetime import datetime
 
 from dbos import DBOSClient
 from sqlalchemy import select
 
 from app.db.tables import Job
+from app.errors import NotFound
 from app.jobs.admission import IN_HAND
 from app.jobs.queue import FINAL_STATES
 from app.telemetry.metrics import JOBS_ENDED
-from workers.workflows import WorkflowContext
+from workers.workflows import WorkflowContext, locked_job
 
 __all__ = ["LostJobs", "close_abandoned_jobs", "has_unfinished_jobs"]
 
@@ -46,12 +48,11 @@ def close_abandoned_jobs(client: DBOSClient, context: WorkflowContext) -> None:
     )
     for entry in abandoned:
         log.warning("%s ended in the job engine as %s", entry.workflow_id, entry.status)
-        with context.sessions.begin() as session:
-            job = session.get(Job, open_jobs[entry.workflow_id], with_for_update=True)
-            if job is None or job.status in FINAL_STATES:  # somebody else was first
-                continue
-            context.builder.fail_build(session, job.id, ABANDONED[entry.status])
-        JOBS_ENDED.labels(job.kind, "failed").inc()
+        with suppress(NotFound), context.sessions.begin() as session:
+            job = locked_job(session, entry.workflow_id)
+            if job.status not in FINAL_STATES:  # nobody else was first
+                context.builder.fail_build(session, job.id, ABANDONED[entry.status])
+                JOBS_ENDED.labels(job.kind, "failed").inc()
 
 
 class LostJobs:
@@ -75,17 +76,17 @@ class LostJobs:
             entries = client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
             known = {entry.workflow_id for entry in entries}
         now_s = time.monotonic()
-        lost = [(row.id, row.admitted_at) for row in in_hand if row.workflow_id not in known]
+        lost = [(row.workflow_id, row.admitted_at) for row in in_hand if row.workflow_id not in known]
         self._since = {each: self._since.get(each, now_s) for each in lost}
-        for (job_id, admitted_at), since_s in self._since.items():
+        for (workflow_id, admitted_at), since_s in self._since.items():
             if now_s - since_s >= self._lost_s:
-                _let_wait_anew(context, job_id, admitted_at)
+                _let_wait_anew(context, workflow_id, admitted_at)
 
 
-def _let_wait_anew(context: WorkflowContext, job_id: str, admitted_at: datetime | None) -> None:
-    with context.sessions.begin() as session:
-        job = session.get(Job, job_id, with_for_update=True)
-        if job is None or job.status in FINAL_STATES or job.admitted_at != admitted_at:  # somebody else was first
+def _let_wait_anew(context: WorkflowContext, workflow_id: str, admitted_at: datetime | None) -> None:
+    with suppress(NotFound), context.sessions.begin() as session:
+        job = locked_job(session, workflow_id)
+        if job.status in FINAL_STATES or job.admitted_at != admitted_at:  # somebody else was first
             return
         log.warning("%s is not known to the job engine any more; it waits anew", job.workflow_id)
         context.queue.enqueue_again(session, job, "its record in the job engine was lost")

@@ -15,9 +15,10 @@ from dbos import DBOSClient
 from sqlalchemy import delete, select, tuple_
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.blobs import BlobStore
 from app.db.tables import Idempotency, Job, Track, TrackState, TrackSteps
 from app.jobs.queue import FINAL_STATES
-from app.jobs.tile_chunks import delete_stale_chunks
+from app.jobs.tile_chunks import discard_stale_chunks
 
 __all__ = ["Upkeep"]
 
@@ -36,6 +37,7 @@ class Upkeep:
 
     client: DBOSClient
     sessions: sessionmaker[Session]
+    blobs: BlobStore
     job_history_days: float
     track_history_days: float | None
 
@@ -83,8 +85,7 @@ class Upkeep:
         return len(old)
 
     def _clean_chunks(self) -> int:
-        with self.sessions.begin() as session:
-            return delete_stale_chunks(session)
+        return discard_stale_chunks(self.sessions, self.blobs)
 
     def _clean_tracks(self, days: float) -> int:
         with self.sessions.begin() as session:

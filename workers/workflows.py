@@ -19,8 +19,10 @@ from sqlalchemy import select
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.blobs import open_blob_store
 from app.db.tables import BUILD, REBUILD, Job
 from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
+from app.jobs.admission import live_slots
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, JobQueue, claim_generation, lock_floor
 from app.jobs.tile_chunks import ChunkBoard
@@ -31,7 +33,7 @@ from workers.builder import Builder, Plan, Result
 from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
 from workers.slots import Slots
 
-__all__ = ["WorkflowContext", "register_workflows"]
+__all__ = ["WorkflowContext", "locked_job", "register_workflows"]
 
 FIT_ATTEMPTS = 3
 DATABASE_ATTEMPTS = 8  # a second, two, four ...: two minutes in all
@@ -109,7 +111,7 @@ class _Steps:
         """From here on uploads ask for the next generation, and this one sees all that came before."""
         try:
             with self._context.sessions.begin() as session:
-                job = _locked_job(session, workflow_id)
+                job = locked_job(session, workflow_id)
                 if job.status in FINAL_STATES:
                     return {"skipped": job.status}
                 if job.cancel_requested:
@@ -147,14 +149,21 @@ class _Steps:
         return self._run_fit(plan, reporter)
 
     def _run_fit(self, plan: Plan, reporter: JobReporter) -> Result:
-        context, board = self._context, ChunkBoard(self._context.sessions, reporter.job_id)
+        context, board = self._context, self._board(reporter.job_id)
         return context.fits.run(context.builder_name, {"plan": plan}, context.blob_url, reporter.report, board)
+
+    def _board(self, job_id: str) -> ChunkBoard | None:
+        """Where a fit may offer tiles to others; None where there are no others."""
+        with self._context.sessions() as session:
+            if live_slots(session) < 2:
+                return None
+        return ChunkBoard(self._context.sessions, open_blob_store(self._context.blob_url, make=False), job_id)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)
         try:
             with self._context.sessions.begin() as session:
-                job = _locked_job(session, workflow_id)
+                job = locked_job(session, workflow_id)
                 self._context.builder.publish_build(session, job.id, plan, result)
                 self._context.queue.admit(session)
             return {"published": True}
@@ -165,7 +174,7 @@ class _Steps:
         """Give the job its last state. A floor or a job that is gone needs none."""
         try:
             with self._context.sessions.begin() as session:
-                job = _locked_job(session, workflow_id)
+                job = locked_job(session, workflow_id)
                 claim_generation(session, job.floor_id, generation)
                 if "cancelled" in outcome:
                     self._context.builder.dismiss_build(session, job.id)
@@ -199,7 +208,8 @@ def _stop_unless_owner(progress: int) -> None:
     DBOS.set_event("progress", progress)
 
 
-def _locked_job(session: Session, workflow_id: str) -> Job:
+def locked_job(session: Session, workflow_id: str) -> Job:
+    """The job, its floor locked before it. Raises NotFound."""
     job = session.scalar(select(Job).where(Job.workflow_id == workflow_id))
     if job is None:
         raise NotFound(f"no job for {workflow_id}")

@@ -361,11 +361,12 @@ class Worker(Base):
 
 class TileChunk(Base):
     """Some tiles of a floor whose fit workers share (docs/decisions/0017). `order_sha256` says what to fit, for
-    programs of this `version`; `taken_by` is a worker or the fit's own, `fits_sha256` what was brought."""
+    programs of this `version`; `taken_by` is a worker or whoever builds the map, `fits_sha256` what was brought."""
 
     __tablename__ = "tile_chunk"
-    job_id: Mapped[str] = mapped_column(Id, primary_key=True)
+    offer_id: Mapped[str] = mapped_column(Id, primary_key=True)
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    job_id: Mapped[str] = mapped_column(Id)
     order_sha256: Mapped[str] = mapped_column(Sha256)
     version: Mapped[str] = mapped_column(String(40))
     taken_by: Mapped[str | None] = mapped_column(String(120))

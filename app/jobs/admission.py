@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, aliased
 from app.db.engine import lock_for_transaction
 from app.db.tables import Job, Worker
 
-__all__ = ["HIGH", "IN_HAND", "LOW", "NORMAL", "admit_next"]
+__all__ = ["HIGH", "IN_HAND", "LOW", "NORMAL", "admit_next", "live_slots"]
 
 HIGH, NORMAL, LOW = 1, 2, 3
 """Priorities, the first served first. What somebody asked for is normal, what follows from an upload is low."""
@@ -44,7 +44,7 @@ def admit_next(session: Session) -> list[Job]:
     lock_for_transaction(session, ADMISSION_LOCK)
     session.flush()
     in_hand = session.execute(select(Job.organisation_id, Job.floor_id).where(IN_HAND)).all()
-    room = _slots(session) - len(in_hand)
+    room = live_slots(session) - len(in_hand)
     if room <= 0:
         return []
     turns = _turns(session, room, {row.floor_id for row in in_hand})
@@ -66,7 +66,7 @@ def admit_next(session: Session) -> list[Job]:
     return admitted
 
 
-def _slots(session: Session) -> int:
+def live_slots(session: Session) -> int:
     """Jobs that the live workers run at one time. One of an older version admits nobody: with it there, all are."""
     slots = session.scalars(select(Worker.slots).where(Worker.state == "live")).all()
     return 2**31 if None in slots else sum(each for each in slots if each is not None)

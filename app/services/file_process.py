@@ -123,19 +123,18 @@ def _read_one(channel: socket.socket, cpu_s: int, memory_bytes: int) -> NoReturn
         code = 0
     except MemoryError:
         code = OUT_OF_MEMORY
+    except Exception:
+        traceback.print_exc()
     finally:
         os._exit(code)
 
 
 def _confine(cpu_s: int, memory_bytes: int) -> None:
-    """No file and no socket from here on; so much more memory, and processor time. Arrow needs a thread."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limits = {
-        resource.RLIMIT_AS: pages * resource.getpagesize() + memory_bytes,
-        resource.RLIMIT_NOFILE: 0,
-        resource.RLIMIT_FSIZE: 0,
-        resource.RLIMIT_CORE: 0,
-    }
+    """No file and no socket from here on; so much more memory (on Linux), and processor time. Arrow needs a thread."""
+    limits = {resource.RLIMIT_NOFILE: 0, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}
+    if sys.platform == "linux":
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limits[resource.RLIMIT_AS] = pages * resource.getpagesize() + memory_bytes
     for limit, most in limits.items():
         resource.setrlimit(limit, (most, most))
     # SIGXCPU says why; a second later it would be SIGKILL, which cannot be ignored.

@@ -54,14 +54,14 @@ class Board(Protocol):
         ...
 
     def withdraw(self) -> None:
-        """Nobody need take anything any more."""
+        """Nobody need take anything any more, and what was brought can go."""
         ...
 
 
 def fit_with_others(board: Board, blobs: BlobStore) -> FitTiles:
-    """Fits tiles together with whoever takes chunks from the board, where they take long.
+    """Fits tiles together with whoever takes chunks from the board, where they take long; alone where the blob store is
 
-    Raises Unavailable where the blob store is away.
+    away.
     """
 
     def fit(order: TileOrder, progress: Progress) -> Iterator[tuple[Tile, TileFit]]:
@@ -81,13 +81,16 @@ def fit_with_others(board: Board, blobs: BlobStore) -> FitTiles:
 
 
 def fit_chunk(order_sha256: str, number: int, blobs: BlobStore, progress: Progress) -> dict[str, str]:
-    """Fit a chunk of somebody's order and store its fits: `fits_sha256`. Raises NotFound when the order is withdrawn,
+    """Fit a chunk of somebody's order and store its fits: `fits_sha256`, or nothing when the order was withdrawn.
 
-    CorruptArtefact when another version of the program made it.
+    Raises CorruptArtefact when another version of the program made it, Unavailable.
     """
     if order_sha256 not in _last_order:  # whoever fits one chunk of an order fits more of it
         _last_order.clear()
-        _last_order[order_sha256] = _order_from_bytes(blobs.get(order_sha256))
+        try:
+            _last_order[order_sha256] = _order_from_bytes(blobs.get(order_sha256))
+        except NotFound:
+            return {}
     order, chunks = _last_order[order_sha256]
     fits, tiles = {}, chunks[number]
     for index, tile in enumerate(tiles):
@@ -101,21 +104,13 @@ def _fit_together(
 ) -> Iterator[tuple[Tile, TileFit]]:
     """The tiles after the first `done`: those nobody has taken, then what others brought, then what they did not."""
     left = dict(enumerate(_chunks(order.tiles[done:], chunk_tiles)))
-    order_sha256 = blobs.put(_order_to_bytes(order, [*left.values()]))
-    board.offer(order_sha256, len(left))
-
-    def place(chunk: int) -> tuple[bool, bool, int]:
-        taken = board.taken()
-        return chunk in taken, taken.get(chunk) is None, chunk
-
-    def say(done: int) -> None:
-        together = ", together with other workers" if board.taken() else ""
-        progress(done / len(order.tiles), f"fitting tile {done + 1:,} of {len(order.tiles):,}{together}")
-
+    order_sha256 = _offered(order, list(left.values()), board, blobs)
     try:
         while left:
-            chunk = min(left, key=place)
-            board.begin(chunk)
+            taken = board.taken()
+            chunk = min(left, key=lambda each: (each in taken, taken.get(each) is None, each))
+            if chunk not in taken:
+                board.begin(chunk)
             fits, tried = dict[Tile, TileFit](), None
             for tile in left[chunk]:
                 brought = board.taken().get(chunk)
@@ -123,16 +118,26 @@ def _fit_together(
                     fits = theirs
                     break
                 tried = brought
-                say(done + len(fits))
+                place, together = done + len(fits), ", together with other workers" if board.taken() else ""
+                progress(place / len(order.tiles), f"fitting tile {place + 1:,} of {len(order.tiles):,}{together}")
                 fits[tile] = order.fit(tile)
             yield from fits.items()
             done += len(left.pop(chunk))
     finally:
-        used = {order_sha256, *filter(None, board.taken().values())}
         board.withdraw()
         with suppress(Unavailable):
-            for sha256 in used:
-                blobs.discard(sha256)
+            if order_sha256 is not None:
+                blobs.discard(order_sha256)
+
+
+def _offered(order: TileOrder, chunks: list[list[Tile]], board: Board, blobs: BlobStore) -> str | None:
+    """The order's hash; None, and nothing offered, where the blob store cannot take it."""
+    try:
+        order_sha256 = blobs.put(_order_to_bytes(order, chunks))
+    except Unavailable:
+        return None
+    board.offer(order_sha256, len(chunks))
+    return order_sha256
 
 
 def _chunks(tiles: Sequence[Tile], size: int) -> list[list[Tile]]:
@@ -149,7 +154,7 @@ def _read_fits(sha256: str | None, tiles: list[Tile], blobs: BlobStore) -> dict[
     """The fits of these tiles that somebody brought; None when they cannot be read."""
     try:
         fits = dict(state_from_bytes(blobs.get(sha256), {}).tiles) if sha256 else {}
-    except (NotFound, CorruptArtefact):
+    except (NotFound, CorruptArtefact, Unavailable):
         return None
     return fits if list(fits) == tiles else None
 

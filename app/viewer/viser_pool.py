@@ -38,7 +38,7 @@ __all__ = ["OrganisationViewer", "ViserPool"]
 
 _log = logging.getLogger(__name__)
 _RECENT_BYTES = 384 * 2**20
-_MOST_SERVERS = 100  # each has a thread, a port and what its scenes hold
+_MOST_SERVERS, _MOST_OF_ONE = 100, 20  # each has a thread, a port and what its scenes hold
 _MOST_LEFT = 50  # of the views that nobody looks at any more, in case somebody comes back
 
 
@@ -126,7 +126,7 @@ class ViserPool:
         async with self._lock:
             viewer = self._viewers.get(reach)
             if viewer is None:
-                await self._make_room()
+                await self._make_room(reach.organisation_id)
                 viewer = await run_in_threadpool(self._start, reach)
                 self._viewers[reach] = viewer
             if self._sweeper is None:
@@ -154,14 +154,18 @@ class ViserPool:
                     del self._viewers[reach]
                     await run_in_threadpool(stop_viser, viewer.server)
 
-    async def _make_room(self) -> None:
+    async def _make_room(self, organisation_id: str) -> None:
         """Stop the server that nobody has looked at for longest, where one more would be too many."""
-        if len(self._viewers) < _MOST_SERVERS:
+        own = [reach for reach in self._viewers if reach.organisation_id == organisation_id]
+        if len(own) >= _MOST_OF_ONE:
+            candidates, told = own, f"{_MOST_OF_ONE} 3-D views of sets of buildings of this organisation"
+        elif len(self._viewers) >= _MOST_SERVERS:
+            candidates, told = list(self._viewers), f"{_MOST_SERVERS} 3-D views of others"
+        else:
             return
-        idle = [reach for reach, viewer in self._viewers.items() if viewer.visitors == 0]
+        idle = [reach for reach in candidates if self._viewers[reach].visitors == 0]
         if not idle:
-            reason = f"{_MOST_SERVERS} 3-D views of others are open, the most at one time; try again in a minute"
-            raise Overloaded(reason, retry_after_s=60.0)
+            raise Overloaded(f"{told} are open, the most at one time; try again in a minute", retry_after_s=60.0)
         longest = min(idle, key=lambda reach: self._viewers[reach].idle_since)
         await run_in_threadpool(stop_viser, self._viewers.pop(longest).server)
 

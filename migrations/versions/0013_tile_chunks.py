@@ -15,8 +15,9 @@ depends_on = None
 def upgrade() -> None:
     op.create_table(
         "tile_chunk",
-        sa.Column("job_id", sa.String(36), primary_key=True),
+        sa.Column("offer_id", sa.String(36), primary_key=True),
         sa.Column("number", sa.Integer(), primary_key=True, autoincrement=False),
+        sa.Column("job_id", sa.String(36), nullable=False),
         sa.Column("order_sha256", sa.String(64), nullable=False),
         sa.Column("version", sa.String(40), nullable=False),
         sa.Column("taken_by", sa.String(120), nullable=True),

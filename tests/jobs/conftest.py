@@ -12,10 +12,10 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
-from sqlalchemy import Engine
+from sqlalchemy import Engine, func, select
 from sqlalchemy.orm import Session, sessionmaker
 
-from app.db.tables import Building, Floor, Job, Organisation, Survey
+from app.db.tables import Building, Floor, Job, Organisation, Survey, Worker
 from app.jobs import FINAL_STATES, JobQueue
 
 ROOT = Path(__file__).parents[2]
@@ -96,6 +96,17 @@ class Site:
                 pytest.fail(f"job {job_id} is still {job.status} at {job.progress} %: {job.message}")
             time.sleep(0.05)
         return job
+
+    def wait_for_workers(self, count: int) -> None:
+        """Until so many live."""
+        living = select(func.count()).where(Worker.state == "live")
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            with self.sessions() as session:
+                if session.scalar(living) == count:
+                    return
+            time.sleep(0.05)
+        pytest.fail(f"there are not {count} workers")
 
     def wait_running(self, job_id: str) -> Job:
         """Until the fit has begun to report."""

@@ -3,7 +3,8 @@
 What a fit does is said by the map's spec or, for rebuilds, by the floor's name: a JSON object with `sleep_s`, `fail`,
 `die_times`, `silent`; `claim_s` holds the floor locked that long, `hold_s` keeps the fit's interpreter busy and lets no
 other thread in, `kill_worker` takes the worker down with the fit. `chunks` are offered to other workers for as long as
-`sleep_s`, or until all are brought; each takes them `chunk_s`, or `kill_helper` takes the worker down that took it.
+`sleep_s`, or until all are brought; each takes them `chunk_s`, or `kill_helper`
+takes the worker down that took it, or it fails with `fail_chunk`.
 """
 
 import json
@@ -64,7 +65,7 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
 
 
 def fit_build(
-    plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None], board: Board
+    plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None], board: Board | None
 ) -> dict[str, Any]:
     note("fit starts", floor_id=plan["floor_id"], map_id=plan["map_id"], surveys=plan["surveys"])
     if plan.get("fail"):
@@ -81,18 +82,20 @@ def fit_build(
     while time.monotonic() - began < plan.get("hold_s", 0.0):
         sum(range(50_000_000))  # a second or so in compiled code that never lets go of the interpreter
     slices, chunks = max(1, round(plan.get("sleep_s", 0.2) / 0.05)), plan.get("chunks", 0)
-    if chunks:
+    if board is not None and chunks:
         board.offer(blobs.put(json.dumps(plan).encode()), chunks)
     for n in range(slices):
-        if chunks and _all_brought(plan, board):
+        if board is not None and chunks and _all_brought(plan, board):
             break
         if not plan.get("silent"):
             progress(n / slices, f"slice {n} of {slices}")
         time.sleep(0.05)
     if chunks:
-        brought = {number: blobs.get(sha256).decode() for number, sha256 in board.taken().items() if sha256}
-        note("brought", floor_id=plan["floor_id"], brought=brought, taken=sorted(board.taken()))
-        board.withdraw()
+        taken = {} if board is None else board.taken()
+        brought = {number: blobs.get(sha256).decode() for number, sha256 in taken.items() if sha256}
+        note("brought", floor_id=plan["floor_id"], brought=brought, taken=sorted(taken))
+        if board is not None:
+            board.withdraw()
     sha256 = blobs.put(json.dumps(sorted(plan["surveys"])).encode())
     note("fit ends", floor_id=plan["floor_id"], map_id=plan["map_id"])
     return {"sha256": sha256}
@@ -113,6 +116,8 @@ def fit_chunk(
     if plan.get("kill_helper"):
         os.kill(os.getppid(), signal.SIGKILL)
         time.sleep(60)
+    if plan.get("fail_chunk"):
+        raise InvalidInput("no memory for that here")
     time.sleep(plan.get("chunk_s", 0.0))
     progress(1.0, "done")
     return {"fits_sha256": blobs.put(f"chunk {number}".encode())}

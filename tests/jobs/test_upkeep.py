@@ -1,12 +1,15 @@
 """Old rows go in small batches, what has not ended stays, and new jobs run after."""
 
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pytest
 from sqlalchemy import Engine, func, insert, select, text
 from sqlalchemy.orm import Session, sessionmaker
 
+from app.blobs import FolderBlobStore
 from app.db.tables import Building, Idempotency, Job, Key, Track, TrackState, TrackSteps
 from app.jobs.engine import open_client
 from workers.upkeep import Upkeep
@@ -45,10 +48,11 @@ def multiply(engine: Engine, name: str, copies: int) -> None:
 def upkeep(engine: Engine, sessions: sessionmaker[Session], days: float = 1.0, tracks: float | None = None) -> int:
     client = open_client(engine)
     try:
-        work, deleted = Upkeep(client, sessions, days, tracks), 0
-        while some := work.clean():
-            deleted += some
-        return deleted
+        with TemporaryDirectory() as folder:
+            work, deleted = Upkeep(client, sessions, FolderBlobStore(Path(folder)), days, tracks), 0
+            while some := work.clean():
+                deleted += some
+            return deleted
     finally:
         client.destroy()
 

@@ -1,13 +1,15 @@
 """A map whose tiles several workers fitted is the map of one, whatever becomes of the others."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from app.blobs import FolderBlobStore
-from app.errors import CorruptArtefact, JobCancelled, NotFound
+from app.errors import CorruptArtefact, JobCancelled
 from app.field.fit import fit_map
 from app.field.samples import Samples
-from app.field.spec import FittedMap, MapSpec
+from app.field.spec import FittedMap, MapSpec, Progress
 from app.services import shared_tiles
 from app.services.artefacts import grid_to_bytes
 from app.services.fit_state import state_to_bytes
@@ -18,6 +20,17 @@ SPECS = {
     "robust": MapSpec(resolution_m=0.5, robust=True, components="norm"),
     "potential": MapSpec(resolution_m=0.5, curl_free=True, noise="white"),
 }
+
+
+class Said:
+    """Progress that is written down: a message for every tile that is fitted here."""
+
+    def __init__(self) -> None:
+        self.tiles: list[str] = []
+
+    def __call__(self, _fraction: float, message: str) -> None:
+        if message.startswith("fitting tile"):
+            self.tiles.append(message)
 
 
 def quiet(fraction: float, message: str) -> None:
@@ -78,10 +91,14 @@ class Others:
 
     def withdraw(self) -> None:
         self.open = False
+        for sha256 in filter(None, self._taken.values()):
+            self._blobs.discard(sha256)
 
 
-def fitted(walks: dict[str, Samples], spec: MapSpec, board: Others, blobs: FolderBlobStore) -> FittedMap:
-    return fit_map(walks, spec, fit_tiles=fit_with_others(board, blobs))
+def fitted(
+    walks: dict[str, Samples], spec: MapSpec, board: Others, blobs: FolderBlobStore, progress: Progress = quiet
+) -> FittedMap:
+    return fit_map(walks, spec, progress, fit_tiles=fit_with_others(board, blobs))
 
 
 def same(one: FittedMap, other: FittedMap) -> bool:
@@ -93,10 +110,11 @@ def same(one: FittedMap, other: FittedMap) -> bool:
 def test_tiles_that_others_brought_are_those_one_would_fit_oneself(
     name: str, walks: dict[str, Samples], blob_store: FolderBlobStore
 ) -> None:
-    alone = fit_map(walks, SPECS[name])
+    alone, said = fit_map(walks, SPECS[name]), Said()
     others = Others(blob_store, brings=range(2, 100))
-    together = fitted(walks, SPECS[name], others, blob_store)
-    assert others.begun[:2] == [0, 1]
+    together = fitted(walks, SPECS[name], others, blob_store, said)
+    assert others.begun == [0, 1]
+    assert len(said.tiles) == len(others.offers) * 4  # two to see how long they take, and two that nobody took
     assert same(together, alone)
     assert not others.open
     assert list(blob_store.stored()) == []
@@ -126,8 +144,18 @@ def test_a_fit_that_is_cancelled_takes_its_offer_back(walks: dict[str, Samples],
         fit_map(walks, SPECS["plane"], cancel, fit_tiles=fit_with_others(others, blob_store))
     assert not others.open
     assert list(blob_store.stored()) == []
-    with pytest.raises(NotFound):
-        fit_chunk("f" * 64, 0, blob_store, quiet)
+    assert fit_chunk(others.offers[0], 0, blob_store, quiet) != {}  # as long as it is remembered
+    assert fit_chunk("f" * 64, 0, blob_store, quiet) == {}
+
+
+def test_a_store_that_takes_no_order_costs_the_help_of_others_alone(
+    walks: dict[str, Samples], blob_store: FolderBlobStore, tmp_path: Path
+) -> None:
+    others = Others(blob_store, brings=range(100))
+    (tmp_path / "blobs").rename(tmp_path / "away")
+    together = fitted(walks, SPECS["plane"], others, blob_store)
+    assert others.offers == []
+    assert same(together, fit_map(walks, SPECS["plane"]))
 
 
 def test_what_is_soon_done_is_not_offered(

@@ -199,6 +199,13 @@ def test_so_many_servers_run_and_the_one_unused_for_longest_makes_room(running, 
         assert looking.ping().wait(5)
     until(nobody_looks)
     assert look(barn).status_code == 200
+    monkeypatch.setattr("app.viewer.viser_pool._MOST_OF_ONE", 1)
+    until(nobody_looks)
+    with running.websocket(barn) as looking:
+        open_page(looking)
+        assert look(south).status_code == 200
+        assert are_running("barn", "south")
+        assert "1 3-D views of sets of buildings of this organisation" in look(north).json()["detail"]
 
 
 def test_signing_out_makes_the_cookie_worthless(running):
