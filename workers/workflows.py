@@ -16,7 +16,7 @@ from dbos import DBOS
 from dbos import error as dbos_error
 from opentelemetry import trace
 from sqlalchemy import select
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.blobs import open_blob_store
@@ -37,7 +37,7 @@ __all__ = ["WorkflowContext", "locked_job", "register_workflows"]
 
 FIT_ATTEMPTS = 3
 DATABASE_ATTEMPTS = 8  # a second, two, four ...: two minutes in all
-BLOB_WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # a store that cannot be reached: two minutes in all, too
+WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # for what a fit cannot reach: two minutes in all, too
 MOST_RECOVERIES = 5  # a job that takes its worker down with it must not do so for ever
 
 Outcome = dict[str, Any]
@@ -122,8 +122,7 @@ class _Steps:
             return {"failed": str(error)}
 
     def fit(self, workflow_id: str, plan: Plan) -> Outcome:
-        with self._context.sessions() as session:
-            job = session.scalar(select(Job).where(Job.workflow_id == workflow_id))
+        job = self._job_once_there_is_a_database(workflow_id)
         if job is None:
             return {"cancelled": True}
         _say_whose(job)
@@ -135,9 +134,22 @@ class _Steps:
         except (FitFailed, Unavailable) as error:
             return {"failed": str(error)}
 
+    def _job_once_there_is_a_database(self, workflow_id: str) -> Job | None:
+        """Raises DBAPIError where the database stays away for the whole wait; tries of the step are for fits."""
+        wanted = select(Job).where(Job.workflow_id == workflow_id)
+        for wait_s in WAITS_S:
+            try:
+                with self._context.sessions() as session:
+                    return session.scalar(wanted)
+            except DBAPIError as error:
+                log.warning("a fit waits %.0f s: %s", wait_s, error)
+                time.sleep(wait_s)
+        with self._context.sessions() as session:
+            return session.scalar(wanted)
+
     def _fit_once_blobs_are_reached(self, plan: Plan, reporter: JobReporter) -> Result:
         """Raises Unavailable where the blob store stays away for the whole wait."""
-        for wait_s in BLOB_WAITS_S:
+        for wait_s in WAITS_S:
             try:
                 return self._run_fit(plan, reporter)
             except Unavailable as error:
@@ -154,9 +166,12 @@ class _Steps:
 
     def _board(self, job_id: str) -> ChunkBoard | None:
         """Where a fit may offer tiles to others; None where there are no others."""
-        with self._context.sessions() as session:
-            if live_slots(session) < 2:
-                return None
+        try:
+            with self._context.sessions() as session:
+                if live_slots(session) < 2:
+                    return None
+        except SQLAlchemyError:  # a fit needs no database
+            return None
         return ChunkBoard(self._context.sessions, open_blob_store(self._context.blob_url, make=False), job_id)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:

@@ -122,7 +122,8 @@ def _blobs(settings: Settings) -> Iterator[Finding]:
         store.get(sha256)
         store.discard(sha256)
     except Unavailable as error:
-        if isinstance(error.__cause__, FileNotFoundError) and not _names_blobs(settings):
+        no_folder = url.startswith("file:") and isinstance(error.__cause__, FileNotFoundError)
+        if no_folder and not _names_blobs(settings):
             advice = (
                 "`isodyn serve` makes that of a new installation; of another, mount its disk or correct the settings"
             )

@@ -66,6 +66,7 @@ class Seen:
     lost: list[str] = field(default_factory=list)
     jobs: Counter[str] = field(default_factory=Counter)
     unended: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
     maps: dict[int, str] = field(default_factory=dict)
     """Of every floor the hash of its last map."""
     seconds: float = 0.0
@@ -78,6 +79,7 @@ class Seen:
             f"  refused and sent again {self.refused}, cut off and sent again {self.interrupted}\n"
             f"  acknowledged and lost: {len(self.lost)}; wrong answers and half-visible maps in {self.looks} looks: "
             f"{len(self.wrong)}\n  jobs: {jobs}; without an end: {len(self.unended)}"
+            + "".join(f"\n  failed: {each}" for each in (*self.failed, *self.lost, *self.wrong))
         )
 
 
@@ -258,6 +260,7 @@ def _wait_for_jobs(client: Client, seen: Seen) -> None:
             break
         time.sleep(0.5)
     seen.jobs = Counter(job["status"] for job in jobs)
+    seen.failed = [job["message"] for job in jobs if job["status"] == "failed"]
 
 
 def _ended(client: Client, job_id: str) -> Any:
