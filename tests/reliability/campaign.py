@@ -147,16 +147,17 @@ def run_campaign(
     seen, start = Seen(), time.monotonic()
     with Client(site.addresses, seen) as client:
         floors = _settle(client, auto_build)
-        with _bad_days(site, seen, seed, every_s), _watched(site, seen, floors), ThreadPoolExecutor(CLIENTS) as pool:
-            streams = [pool.submit(_upload, site, seen, floors, k, uploads, pace_s) for k in range(CLIENTS)]
-            for stream in streams:
-                stream.result()
-        _wait_for_jobs(client, seen)
-        _look_for_losses(client, seen, floors)
-        for k, floor in enumerate(floors):
-            headers = {"Idempotency-Key": f"last-{k}"}
-            job = client.ask("POST", f"/v1/floors/{floor}/maps", json={}, headers=headers)["job"]
-            seen.maps[k] = str(_ended(client, job["id"])["result"]["sha256"])
+        with _watched(site, seen, floors):
+            with _bad_days(site, seen, seed, every_s), ThreadPoolExecutor(CLIENTS) as pool:
+                streams = [pool.submit(_upload, site, seen, floors, k, uploads, pace_s) for k in range(CLIENTS)]
+                for stream in streams:
+                    stream.result()
+            _wait_for_jobs(client, seen)
+            _look_for_losses(client, seen, floors)
+            for k, floor in enumerate(floors):
+                headers = {"Idempotency-Key": f"last-{k}"}
+                job = client.ask("POST", f"/v1/floors/{floor}/maps", json={}, headers=headers)["job"]
+                seen.maps[k] = str(_ended(client, job["id"])["result"]["sha256"])
     seen.seconds = time.monotonic() - start
     return seen
 
