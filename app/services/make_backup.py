@@ -25,7 +25,7 @@ from app.services.references import References, references
 __all__ = ["LEFT_OUT", "Backup", "make_backup"]
 
 LEFT_OUT = frozenset({Worker.__tablename__, TileChunk.__tablename__})
-"""Tables that are of the running processes alone: the leases of workers."""
+"""Tables that are of the running processes alone: the leases of workers, and the tiles that they share."""
 
 
 @dataclass(frozen=True, slots=True)
