@@ -166,13 +166,13 @@ class _Steps:
 
     def _board(self, job_id: str) -> ChunkBoard | None:
         """Where a fit may offer tiles to others; None where there are no others."""
+        board = ChunkBoard(self._context.sessions, open_blob_store(self._context.blob_url, make=False), job_id)
+        board.clear()
         try:
             with self._context.sessions() as session:
-                if live_slots(session) < 2:
-                    return None
+                return board if live_slots(session) > 1 else None
         except SQLAlchemyError:  # a fit needs no database
             return None
-        return ChunkBoard(self._context.sessions, open_blob_store(self._context.blob_url, make=False), job_id)
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)

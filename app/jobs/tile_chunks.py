@@ -63,6 +63,16 @@ class ChunkBoard:
 
         _discard(self._blobs, self._attempt(change, set()))
 
+    def clear(self) -> None:
+        """Forget what a worker offered that had the job before, and died."""
+        mine = TileChunk.job_id == self._job_id
+
+        def change(session: Session) -> set[str]:
+            there = session.scalar(select(TileChunk.number).where(mine).limit(1)) is not None
+            return _delete(session, mine) if there else set()
+
+        _discard(self._blobs, self._attempt(change, set()))
+
     def begin(self, number: int) -> None:
         """Take a chunk, where nobody has, so that nobody else does."""
         free = TileChunk.offer_id == self._offer_id, TileChunk.number == number, TileChunk.taken_by.is_(None)
