@@ -25,7 +25,7 @@ from app.errors import IsodynError, JobCancelled, NotFound, Unavailable
 from app.jobs.admission import live_slots
 from app.jobs.progress import JobReporter
 from app.jobs.queue import FINAL_STATES, JobQueue, claim_generation, lock_floor
-from app.jobs.tile_chunks import ChunkBoard
+from app.jobs.tile_chunks import ChunkBoard, is_offering
 from app.telemetry.facts import add_facts, with_facts
 from app.telemetry.metrics import JOB_STEP_SECONDS, JOBS_ENDED
 from app.telemetry.tracing import link_to
@@ -167,12 +167,14 @@ class _Steps:
     def _board(self, job_id: str) -> ChunkBoard | None:
         """Where a fit may offer tiles to others; None where there are no others."""
         board = ChunkBoard(self._context.sessions, open_blob_store(self._context.blob_url, make=False), job_id)
-        board.clear()
         try:
             with self._context.sessions() as session:
-                return board if live_slots(session) > 1 else None
+                left, others = is_offering(session, job_id), live_slots(session) > 1
         except SQLAlchemyError:  # a fit needs no database
             return None
+        if left:
+            board.clear()
+        return board if others else None
 
     def publish(self, workflow_id: str, plan: Plan, result: Result) -> Outcome:
         _stop_unless_owner(100)

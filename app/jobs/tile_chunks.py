@@ -18,7 +18,7 @@ from app.blobs import BlobStore
 from app.db.tables import Job, TileChunk, new_id
 from app.errors import Unavailable
 
-__all__ = ["BUILDER", "Chunk", "ChunkBoard", "bring_chunk", "discard_stale_chunks", "take_chunk"]
+__all__ = ["BUILDER", "Chunk", "ChunkBoard", "bring_chunk", "discard_stale_chunks", "is_offering", "take_chunk"]
 
 BUILDER = "builder"
 """Who takes what the worker that builds the map fits itself."""
@@ -66,12 +66,7 @@ class ChunkBoard:
     def clear(self) -> None:
         """Forget what a worker offered that had the job before, and died."""
         mine = TileChunk.job_id == self._job_id
-
-        def change(session: Session) -> set[str]:
-            there = session.scalar(select(TileChunk.number).where(mine).limit(1)) is not None
-            return _delete(session, mine) if there else set()
-
-        _discard(self._blobs, self._attempt(change, set()))
+        _discard(self._blobs, self._attempt(lambda session: _delete(session, mine), set()))
 
     def begin(self, number: int) -> None:
         """Take a chunk, where nobody has, so that nobody else does."""
@@ -101,6 +96,11 @@ class ChunkBoard:
             self._not_before_s = time.monotonic() + AWAY_S
             log.warning("the tiles of job %s are not shared with other workers for now: %s", self._job_id, error)
             return otherwise
+
+
+def is_offering(session: Session, job_id: str) -> bool:
+    """Whether there are chunks of a job."""
+    return session.scalar(select(TileChunk.number).where(TileChunk.job_id == job_id).limit(1)) is not None
 
 
 def take_chunk(session: Session, worker_id: str) -> Chunk | None:

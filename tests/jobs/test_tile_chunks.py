@@ -158,6 +158,7 @@ def test_another_version_and_a_job_that_ended_offer_nothing(
     assert list(blob_store.stored()) == []
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)  # no database has a part in it
 def test_a_helper_that_fails_leaves_the_chunks_to_others(
     board: ChunkBoard, site: "Site", blob_store: FolderBlobStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +178,7 @@ def test_a_helper_that_fails_leaves_the_chunks_to_others(
     assert 1 <= len(board.taken()) <= 2  # one a slot
 
 
+@pytest.mark.parametrize("database_url", [pytest.param("postgres", marks=pytest.mark.postgres)], indirect=True)
 def test_a_worker_with_a_free_slot_helps_and_its_end_costs_no_job(crew: "Crew", site: "Site") -> None:
     crew.environment["ISODYN_WORKER_PROCESSES"] = "1"
     crew.hire(lease_ttl_s=30.0)
