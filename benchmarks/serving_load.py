@@ -251,10 +251,15 @@ async def _open(
     async def one(due: float) -> None:
         is_cold = draw.random() < COLD_SHARE
         request = draw.choice(cold if is_cold else hot)
-        way = idle.pop() if idle else await asyncio.open_connection("127.0.0.1", draw.choice(ports))
-        if way[0].at_eof():  # the server closes what is idle for long
+        used = idle.pop() if idle else None
+        way = used or await asyncio.open_connection("127.0.0.1", draw.choice(ports))
+        try:
+            done = await _ask(*way, request)
+        except (ConnectionError, asyncio.IncompleteReadError):  # the server closes what is idle for long
+            if used is None:
+                raise
             way = await asyncio.open_connection("127.0.0.1", draw.choice(ports))
-        done = await _ask(*way, request)
+            done = await _ask(*way, request)
         answered.append((1e3 * (time.perf_counter() - due), is_cold, done))
         idle.append(way)
 

@@ -90,6 +90,7 @@ def test_stores_beside_each_other_and_strange_objects_are_not_listed(s3: Server,
     assert [each.sha256 for each in store.stored()] == [sha256]
 
 
+@pytest.mark.slow
 def test_many_pages_are_listed(address: str) -> None:
     store = open_blob_store(address)
     with ThreadPoolExecutor(8) as pool:

@@ -224,8 +224,8 @@ class _Program:
 def _converse(channel: socket.socket, order: Order, deadline: float) -> bytes | None:
     """Send an order, receive its answer. Raises TimeoutError, and OSError where the child has gone."""
     header = order_header(order)
-    for part in (LENGTH.pack(len(header)), header, LENGTH.pack(len(order.data)), order.data):
-        channel.settimeout(max(deadline - monotonic(), 0.001))
+    for part in filter(None, (LENGTH.pack(len(header)), header, LENGTH.pack(len(order.data)), order.data)):
+        channel.settimeout(max(deadline - monotonic(), 0.001))  # an empty file is answered before it could be sent
         channel.sendall(part)
     (length,) = LENGTH.unpack(_received(channel, LENGTH.size, deadline))
     if length > MAX_ANSWER_BYTES:

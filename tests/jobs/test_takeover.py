@@ -43,7 +43,9 @@ def workers(sessions: sessionmaker[Session]) -> set[str]:
     ("successor", "ttl_s"),
     [
         pytest.param("var", 600.0, id="restarted, which knows of the death at once"),
-        pytest.param("elsewhere", 3.0, id="on another machine, which waits for the lease to run out"),
+        pytest.param(
+            "elsewhere", 3.0, id="on another machine, which waits for the lease to run out", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_the_next_worker_finishes_what_a_killed_one_began(
