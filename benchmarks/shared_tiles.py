@@ -3,7 +3,7 @@
 Both sides are real workers of one slot on the same cores and floor: one alone, and one beside it that helps. The maps
 must be the same to the byte. Times are of whole builds: reading, learning (not shared), tiles, scores, storing.
 
-    python benchmarks/shared_tiles.py [DATABASE_URL] [--side 100] [--workers 2]   exits 1 when a map differs, or when
+    python benchmarks/shared_tiles.py [DATABASE_URL] [--side 200] [--workers 2]   exits 1 when a map differs, or when
                                             the build is not 1.4 times as fast with two workers on two free cores
 """
 
@@ -76,7 +76,7 @@ def build(installation: Installation, floor: Floor) -> tuple[float, str, int]:
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("database_url", nargs="?")
-    parser.add_argument("--side", type=float, default=100.0)
+    parser.add_argument("--side", type=float, default=200.0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=REPEATS)
     asked = parser.parse_args()
