@@ -16,10 +16,10 @@ import time
 from map_growth import SURVEY_SAMPLES, surveys
 from sqlalchemy import func, select
 from tqdm import tqdm
-from worker_efficiency import Installation
+from worker_efficiency import Installation, make_building, make_floor
 
 from app.blobs import open_blob_store
-from app.db.tables import Building, Floor, Job, Map, Organisation, Survey, TileChunk
+from app.db.tables import Floor, Job, Map, Survey, TileChunk
 from app.jobs.tile_chunks import BUILDER
 from app.services.artefacts import samples_to_bytes
 
@@ -30,25 +30,17 @@ SPEC = {"kernel": "matern32", "resolution_m": 0.5, "components": "norm", "robust
 TARGET = 1.4
 
 
-def make_floor(installation: Installation, blob_url: str, side_m: float) -> Floor:
+def make_walked_floor(installation: Installation, blob_url: str, side_m: float) -> Floor:
     """A square floor with its surveys."""
     blobs = open_blob_store(blob_url)
     count = max(SURVEY_SAMPLES * 4, round(SAMPLES_PER_M2 * side_m**2 / SURVEY_SAMPLES) * SURVEY_SAMPLES)
     with installation.sessions.begin() as session:
-        owner = Organisation(name=f"benchmark {time.time_ns()}")
-        session.add(owner)
-        session.flush()
-        building = Building(organisation_id=owner.id, name="b")
-        session.add(building)
-        session.flush()
-        floor = Floor(organisation_id=owner.id, building_id=building.id, name="f", ordinal=0, elevation_m=0.0)
-        session.add(floor)
-        session.flush()
+        floor = make_floor(session, make_building(session))
         for name, samples in tqdm(surveys(count, side_m**2).items(), desc=f"{side_m:g} m square", leave=False):
             sha256 = blobs.put(samples_to_bytes(samples))
             session.add(
                 Survey(
-                    organisation_id=owner.id, floor_id=floor.id, name=name, format="csv", frame="building",
+                    organisation_id=floor.organisation_id, floor_id=floor.id, name=name, format="csv", frame="building",
                     raw_sha256=sha256, samples_sha256=sha256, sample_count=len(samples), report={},
                 )
             )  # fmt: skip
@@ -85,7 +77,7 @@ def main() -> int:
         blob_url = os.environ.setdefault("ISODYN_BLOB_URL", f"file://{folder}/blobs")
         installation = Installation(asked.database_url or f"sqlite:///{folder}/isodyn.db", folder, START)
         try:
-            small, large = (make_floor(installation, blob_url, side_m) for side_m in (60.0, asked.side))
+            small, large = (make_walked_floor(installation, blob_url, side_m) for side_m in (60.0, asked.side))
             times_s: dict[int, list[float]] = {}
             hashes = set()
             for _ in range(asked.repeats):

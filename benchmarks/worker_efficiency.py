@@ -64,6 +64,27 @@ def dismiss_build(session: Session, job_id: str) -> None:
     session.get_one(Job, job_id).status = "dismissed"
 
 
+def make_building(session: Session) -> Building:
+    """One of an organisation of its own."""
+    owner = Organisation(name=f"benchmark {time.time_ns()}")
+    session.add(owner)
+    session.flush()
+    building = Building(organisation_id=owner.id, name="b")
+    session.add(building)
+    session.flush()
+    return building
+
+
+def make_floor(session: Session, building: Building) -> Floor:
+    """One more."""
+    floor = Floor(
+        organisation_id=building.organisation_id, building_id=building.id, name="f", ordinal=0, elevation_m=0.0
+    )
+    session.add(floor)
+    session.flush()
+    return floor
+
+
 class Installation:
     """A database, workers, and jobs that spin."""
 
@@ -100,19 +121,17 @@ class Installation:
     def ask(self, count: int, cost_s: float) -> list[str]:
         """So many jobs, each on a floor of its own."""
         with self.sessions.begin() as session:
-            owner = Organisation(name=f"benchmark {time.time_ns()}")
-            session.add(owner)
-            session.flush()
-            building = Building(organisation_id=owner.id, name="b")
-            session.add(building)
-            session.flush()
-            ids = []
+            building, ids = make_building(session), []
             for _ in range(count):
-                floor = Floor(organisation_id=owner.id, building_id=building.id, name="f", ordinal=0, elevation_m=0.0)
-                session.add(floor)
-                session.flush()
+                floor = make_floor(session, building)
                 spec = {"cost_s": cost_s}
-                row = Map(organisation_id=owner.id, floor_id=floor.id, status="accepted", spec=spec, survey_ids=[])
+                row = Map(
+                    organisation_id=floor.organisation_id,
+                    floor_id=floor.id,
+                    status="accepted",
+                    spec=spec,
+                    survey_ids=[],
+                )
                 session.add(row)
                 ids.append(self.queue.enqueue_build(session, row).id)
         return ids
