@@ -21,6 +21,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from app.blobs import open_blob_store
 from app.db.engine import create_database_engine, migrate, session_factory
+from app.jobs.admission import has_admitted
 from app.jobs.engine import QUEUE, engine_configuration, open_client
 from app.jobs.lease import Lease
 from app.jobs.queue import JobQueue
@@ -72,7 +73,7 @@ def run_worker(
     lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)
-    _launch(engine, lease.worker_id, settings.worker_processes, context.slots)
+    _launch(engine, lease.worker_id, settings.worker_processes, context)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
     _start_thread("helper", Helper(context, lease.worker_id).run, stop)
     upkeep = Upkeep(client, context.sessions, blobs, settings.job_history_days, settings.track_history_days)
@@ -100,15 +101,23 @@ def _start_thread(name: str, target: Callable[..., None], *arguments: object) ->
     threading.Thread(target=target, args=arguments, name=name, daemon=True).start()
 
 
-def _launch(engine: Engine, worker_id: str, fits_at_one_time: int, slots: Slots) -> None:
+def _launch(engine: Engine, worker_id: str, fits_at_one_time: int, context: WorkflowContext) -> None:
     job_engine = DBOS(config=engine_configuration(engine.url, worker_id))
     DBOS.listen_queues([])  # our slots do
     DBOS.launch()
-    # The queue's row is shared: of workers set differently, the one that started last decides for all.
     queue = DBOS.register_queue(
         QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=POLL_S
     )
-    slots.fill(job_engine, queue)
+    queue.database_backed_queue = False  # its row is shared, and read before every poll; each worker has its own slots
+
+    def is_wanted() -> bool:
+        try:
+            with context.sessions() as session:
+                return has_admitted(session)
+        except SQLAlchemyError:  # the engine's own poll says so
+            return True
+
+    context.slots.fill(job_engine, queue, is_wanted)
 
 
 def _end_when_lost(lease: Lease) -> None:

@@ -13,7 +13,7 @@ from app.jobs.lease import Lease
 from app.telemetry.metrics import WORKERS_TAKEN_OVER
 from workers.janitor import hand_over
 from workers.lifeline import Lifeline
-from workers.reconcile import LostJobs, close_abandoned_jobs, has_unfinished_jobs
+from workers.reconcile import Reconciler, has_unfinished_jobs
 from workers.workflows import WorkflowContext
 
 __all__ = ["Reaper"]
@@ -32,15 +32,14 @@ class Reaper:
     lifeline: Lifeline
     client: DBOSClient
     context: WorkflowContext
-    lost: LostJobs = field(default_factory=LostJobs)
+    reconciler: Reconciler = field(default_factory=Reconciler)
 
     def run(self, stop: threading.Event) -> None:
         """Look at once, and then again and again, until told to stop."""
         while True:
             try:
                 self._bury_the_dead()
-                close_abandoned_jobs(self.client, self.context)
-                self.lost.look(self.client, self.context)
+                self.reconciler.look(self.client, self.context)
                 self._admit_the_waiting()
             except Exception:  # whatever it was: a worker that stops looking leaves the dead unburied
                 log.exception("could not look after dead workers; trying again")

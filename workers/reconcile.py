@@ -12,11 +12,11 @@ from sqlalchemy import select
 from app.db.tables import Job
 from app.errors import NotFound
 from app.jobs.admission import IN_HAND
-from app.jobs.queue import FINAL_STATES
+from app.jobs.queue import FINAL_STATES, locked_job
 from app.telemetry.metrics import JOBS_ENDED
-from workers.workflows import WorkflowContext, locked_job
+from workers.workflows import WorkflowContext
 
-__all__ = ["LostJobs", "close_abandoned_jobs", "has_unfinished_jobs"]
+__all__ = ["Reconciler", "has_unfinished_jobs"]
 
 ABANDONED = {
     "CANCELLED": "cancelled in the job engine by an operator",
@@ -24,7 +24,7 @@ ABANDONED = {
     "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "given up: its worker died every time it was tried; see the log of the worker",
 }
 
-LOST_S = 60.0  # far above what a fit takes to end after its next report, tries and all
+LOST_S = 60.0  # whoever is at work on one may end it meanwhile
 
 log = logging.getLogger(__name__)
 
@@ -36,30 +36,11 @@ def has_unfinished_jobs(client: DBOSClient, worker_id: str) -> bool:
     )
 
 
-def close_abandoned_jobs(client: DBOSClient, context: WorkflowContext) -> None:
-    """Give a last state to jobs that look open although the engine will never touch them again."""
-    with context.sessions() as session:
-        rows = session.execute(select(Job.workflow_id, Job.id).where(IN_HAND))
-        open_jobs = {row.workflow_id: row.id for row in rows}
-    if not open_jobs:
-        return
-    abandoned = client.list_workflows(
-        workflow_ids=list(open_jobs), status=list(ABANDONED), load_input=False, load_output=False
-    )
-    for entry in abandoned:
-        log.warning("%s ended in the job engine as %s", entry.workflow_id, entry.status)
-        with suppress(NotFound), context.sessions.begin() as session:
-            job = locked_job(session, entry.workflow_id)
-            if job.status not in FINAL_STATES:  # nobody else was first
-                context.builder.fail_build(session, job.id, ABANDONED[entry.status])
-                JOBS_ENDED.labels(job.kind, "failed").inc()
+class Reconciler:
+    """Ends jobs that the engine gave up, and lets those wait anew of which it has no record: it was deleted by hand,
 
-
-class LostJobs:
-    """Jobs in hand of which the engine has no record: it was deleted by hand, or one of the two schemas was restored.
-
-    Nobody would end them, and their slots and floors would be taken for ever. They wait anew, but not before whoever
-    may be at work on one has been stopped: the engine refuses reports on a job that it has no record of.
+    or one of the two schemas was restored. Nobody else would, and their slots and floors would be taken for ever. A
+    worker that is still at one has lost it from then on, and sees so at its next report.
     """
 
     def __init__(self, lost_s: float = LOST_S) -> None:
@@ -67,20 +48,33 @@ class LostJobs:
         self._since: dict[tuple[str, datetime | None], float] = {}
 
     def look(self, client: DBOSClient, context: WorkflowContext) -> None:
-        """Let those wait anew that have been lost for so long."""
+        """End what was given up, and let wait anew what has been lost for so long."""
         with context.sessions() as session:
             in_hand = session.execute(select(Job.workflow_id, Job.id, Job.admitted_at).where(IN_HAND)).all()
-        known = set()  # asked for later than the jobs: a job and its record are of one transaction
+        known = {}  # asked for later than the jobs: a job and its record are of one transaction
         if in_hand:
             names = [row.workflow_id for row in in_hand]
             entries = client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
-            known = {entry.workflow_id for entry in entries}
+            known = {entry.workflow_id: entry.status for entry in entries}
+        for workflow_id, status in known.items():
+            if status in ABANDONED:
+                log.warning("%s ended in the job engine as %s", workflow_id, status)
+                _fail(context, workflow_id, ABANDONED[status])
         now_s = time.monotonic()
         lost = [(row.workflow_id, row.admitted_at) for row in in_hand if row.workflow_id not in known]
         self._since = {each: self._since.get(each, now_s) for each in lost}
         for (workflow_id, admitted_at), since_s in self._since.items():
             if now_s - since_s >= self._lost_s:
                 _let_wait_anew(context, workflow_id, admitted_at)
+
+
+def _fail(context: WorkflowContext, workflow_id: str, message: str) -> None:
+    with suppress(NotFound), context.sessions.begin() as session:
+        job = locked_job(session, workflow_id)
+        if job.status not in FINAL_STATES:  # nobody else was first
+            context.builder.fail_build(session, job.id, message)
+            job.plan = None
+            JOBS_ENDED.labels(job.kind, "failed").inc()
 
 
 def _let_wait_anew(context: WorkflowContext, workflow_id: str, admitted_at: datetime | None) -> None:

@@ -261,8 +261,9 @@ class Job(Base):
     """What a user sees of background work. `workflow_id` names it in the engine: one row per workflow.
 
     `status`: accepted, running, successful, failed, dismissed (OGC API Processes). `priority`: 1, 2 or 3, the first
-    served first; `admitted_at`: when the job was handed to the engine (`app.jobs.admission`). `request_id` and
-    `traceparent` are of the request that asked for it first, for the log and for traces."""
+    served first; `admitted_at`: when the job was handed to the engine (`app.jobs.admission`). `fencing_token`: whose
+    try at it counts; `plan`: what the first try was to build, while it runs. `request_id` and `traceparent` are of the
+    request that asked for it first, for the log and for traces."""
 
     __tablename__ = "job"
     __table_args__ = (
@@ -282,6 +283,8 @@ class Job(Base):
     progress: Mapped[int] = mapped_column(default=0)
     message: Mapped[str] = mapped_column(default="waiting for a worker")
     cancel_requested: Mapped[bool] = mapped_column(default=False)
+    fencing_token: Mapped[str | None] = mapped_column(Id)
+    plan: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]

@@ -15,13 +15,15 @@ from sqlalchemy.orm import Session, aliased
 from app.db.engine import lock_for_transaction
 from app.db.tables import Job, Worker
 
-__all__ = ["HIGH", "IN_HAND", "LOW", "NORMAL", "admit_next", "live_slots"]
+__all__ = ["HIGH", "IN_HAND", "LOW", "NORMAL", "admit_next", "has_admitted", "live_slots"]
 
 HIGH, NORMAL, LOW = 1, 2, 3
 """Priorities, the first served first. What somebody asked for is normal, what follows from an upload is low."""
 
 IN_HAND = or_(Job.status == "running", (Job.status == "accepted") & Job.admitted_at.is_not(None))
 """Jobs that the engine has: as many as there are slots, however many wait."""
+
+_ADMITTED = select(Job.id).where(Job.status == "accepted", Job.admitted_at.is_not(None)).limit(1)
 
 LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
 ADMISSION_LOCK = 0x150D_12  # any constant of our own: PostgreSQL's advisory locks are numbers
@@ -64,6 +66,11 @@ def admit_next(session: Session) -> list[Job]:
             del turns[organisation_id]
     session.flush()
     return admitted
+
+
+def has_admitted(session: Session) -> bool:
+    """Whether the engine has a job that no worker has begun."""
+    return session.scalar(_ADMITTED) is not None
 
 
 def live_slots(session: Session) -> int:

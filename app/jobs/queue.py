@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 
 from dbos import EnqueueOptions
-from sqlalchemy import Engine, select, update
+from sqlalchemy import ColumnElement, Engine, select, update
 from sqlalchemy.orm import Session
 
 from app.db.tables import BUILD, REBUILD, Floor, Job, Map
@@ -19,7 +19,7 @@ from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from app.telemetry.facts import request_id
 from app.telemetry.tracing import traceparent
 
-__all__ = ["FINAL_STATES", "JobQueue", "claim_generation", "lock_floor"]
+__all__ = ["FINAL_STATES", "JobQueue", "claim_generation", "lock_floor", "locked_job"]
 
 FINAL_STATES = ("successful", "failed", "dismissed")
 
@@ -108,13 +108,17 @@ class JobQueue:
         After a restore, which does not bring the engine's own tables back, and where its record was lost.
         """
         job.status, job.progress, job.started_at, job.admitted_at = "accepted", 0, None, None
+        job.fencing_token = job.plan = None
         job.message = f"waiting for a worker, anew: {why}"
         begun = update(Map).where(Map.id == job.map_id, Map.status == "running")
         session.execute(begun.values(status="accepted"))
 
     def recorded(self, session: Session) -> Iterator[object]:
-        """What the engine has recorded of the steps of every job in hand: plans and results. What waits has none."""
-        for workflow_id in session.scalars(select(Job.workflow_id).where(IN_HAND)).all():
+        """What every job in hand was claimed to do: its plan. What waits has none."""
+        jobs = session.execute(select(Job.workflow_id, Job.plan).where(IN_HAND)).all()
+        for _, plan in jobs:
+            yield plan
+        for workflow_id, _ in jobs:  # a worker of an older version let the engine keep it
             for step in self._client.list_workflow_steps(workflow_id):
                 yield step["output"]
 
@@ -134,22 +138,36 @@ class JobQueue:
 
 def lock_floor(session: Session, floor_id: str) -> int:
     """Lock the floor's row until the transaction ends, and return its `claimed_generation`. Raises NotFound."""
-    session.flush()
-    statement = (
-        update(Floor)
-        .where(Floor.id == floor_id)
-        .values(claimed_generation=Floor.claimed_generation)
-        .returning(Floor.claimed_generation)
-        .execution_options(synchronize_session=False)
-    )
-    generation = session.scalar(statement)
+    generation = _lock(session, Floor.id == floor_id)
     if generation is None:
         raise NotFound(f"no floor {floor_id}")
     return generation
 
 
+def locked_job(session: Session, workflow_id: str) -> Job:
+    """The job, its floor locked before it. Raises NotFound."""
+    of_job = select(Job.floor_id).where(Job.workflow_id == workflow_id).scalar_subquery()
+    if _lock(session, Floor.id == of_job) is None or (job := _job_named(session, workflow_id)) is None:
+        raise NotFound(f"no job for {workflow_id}, or no floor for it")
+    return job
+
+
+def _lock(session: Session, floor: ColumnElement[bool]) -> int | None:
+    session.flush()
+    statement = (
+        update(Floor)
+        .where(floor)
+        .values(claimed_generation=Floor.claimed_generation)
+        .returning(Floor.claimed_generation)
+        .execution_options(synchronize_session=False)
+    )
+    return session.scalar(statement)
+
+
 def claim_generation(session: Session, floor_id: str, generation: int) -> None:
     """From here on whoever asks for a rebuild of the floor gets a later one than `generation`. Locks the floor."""
+    if generation == 0:  # of a build of a given map
+        return
     statement = (
         update(Floor)
         .where(Floor.id == floor_id, Floor.claimed_generation < generation)

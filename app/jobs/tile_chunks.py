@@ -18,7 +18,7 @@ from app.blobs import BlobStore
 from app.db.tables import Job, TileChunk, new_id
 from app.errors import Unavailable
 
-__all__ = ["BUILDER", "Chunk", "ChunkBoard", "bring_chunk", "discard_stale_chunks", "is_offering", "take_chunk"]
+__all__ = ["BUILDER", "Chunk", "ChunkBoard", "bring_chunk", "discard_stale_chunks", "take_chunk"]
 
 BUILDER = "builder"
 """Who takes what the worker that builds the map fits itself."""
@@ -96,11 +96,6 @@ class ChunkBoard:
             self._not_before_s = time.monotonic() + AWAY_S
             log.warning("the tiles of job %s are not shared with other workers for now: %s", self._job_id, error)
             return otherwise
-
-
-def is_offering(session: Session, job_id: str) -> bool:
-    """Whether there are chunks of a job."""
-    return session.scalar(select(TileChunk.number).where(TileChunk.job_id == job_id).limit(1)) is not None
 
 
 def take_chunk(session: Session, worker_id: str) -> Chunk | None:

@@ -16,7 +16,7 @@ from app.jobs import JobQueue
 from app.jobs.admission import HIGH, LOW, NORMAL
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from workers.builder import DEFAULT_BUILDER, load_builder
-from workers.reconcile import LostJobs, close_abandoned_jobs
+from workers.reconcile import Reconciler
 from workers.slots import Slots
 from workers.workflows import WorkflowContext
 
@@ -186,8 +186,9 @@ def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(site: "Site",
     client = open_client(engine)
     client.cancel_workflow(site.job(given_up).workflow_id)
     before = ended()
+    reconciler = Reconciler()
     for _ in range(2):
-        close_abandoned_jobs(client, context_of(site))
+        reconciler.look(client, context_of(site))
     client.destroy()
     assert site.job(given_up).status == "failed"
     assert ended() == before + 1
@@ -208,7 +209,7 @@ def test_a_job_whose_record_in_the_engine_is_lost_waits_anew_once(
         session.get_one(Map, job.map_id).status = status
     sound_since = site.job(sound).admitted_at
     client = open_client(engine)
-    patient, first, second = LostJobs(), LostJobs(0.0), LostJobs(0.0)
+    patient, first, second = Reconciler(), Reconciler(0.0), Reconciler(0.0)
     client.delete_workflows([job.workflow_id])
     patient.look(client, context_of(site))
     assert site.job(lost).status == status, "whoever is at work on it is given time to notice"

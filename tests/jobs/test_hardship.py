@@ -100,7 +100,7 @@ def test_a_worker_beats_while_an_interpreter_is_busy(
 
 @pytest.mark.slow
 def test_a_job_half_done_by_one_version_is_finished_by_the_next(crew: "Crew", site: "Site") -> None:
-    floor = site.floor(sleep_s=2.0)
+    floor = site.floor(sleep_s=3.0)
     worker = crew.hire()
     _, job_id = site.upload(floor)
     site.wait_running(job_id)

@@ -74,7 +74,7 @@ def after(worker: "Popen[bytes]", hosts: Network, way: Callable[..., None]) -> N
 
 def take_over(crew: "Crew", site: "Site", hosts: Network, way: Callable[..., None], lease_ttl_s: float) -> float:
     """Host a takes a job and dies that way, host b finishes it: seconds from the one to the other."""
-    floor = site.floor(sleep_s=2.0)
+    floor = site.floor(sleep_s=3.0)
     first = crew.hire("on a", prefix=hosts.on("a"), lease_ttl_s=lease_ttl_s)
     _, job_id = site.upload(floor)
     site.wait_running(job_id)

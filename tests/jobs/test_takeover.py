@@ -51,7 +51,7 @@ def workers(sessions: sessionmaker[Session]) -> set[str]:
 def test_the_next_worker_finishes_what_a_killed_one_began(
     crew: "Crew", site: "Site", successor: str, ttl_s: float
 ) -> None:
-    floor = site.floor(sleep_s=1.5)
+    floor = site.floor(sleep_s=2.5)
     first = crew.hire(lease_ttl_s=ttl_s)
     _, job_id = site.upload(floor)
     site.wait_running(job_id)
@@ -96,7 +96,7 @@ def test_a_cancelled_job_of_a_killed_worker_is_not_done_again(crew: "Crew", site
 
 
 def test_asked_to_stop_a_worker_finishes_its_job_first(crew: "Crew", site: "Site") -> None:
-    floor = site.floor(sleep_s=2.0)
+    floor = site.floor(sleep_s=3.0)
     worker = crew.hire(drain_s=20.0)
     _, job_id = site.upload(floor)
     site.wait_running(job_id)

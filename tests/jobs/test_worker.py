@@ -13,7 +13,6 @@ from sqlalchemy import select
 from app.blobs import FolderBlobStore
 from app.db.tables import Floor, Job, Map, Survey
 from app.jobs.engine import open_client
-from workers.reconcile import LOST_S
 
 if TYPE_CHECKING:
     from conftest import Crew, Site
@@ -147,7 +146,7 @@ def test_cancelling_a_running_fit_ends_it_and_frees_the_floor(crew: "Crew", site
 
 
 def test_a_job_cancelled_while_waiting_never_starts(crew: "Crew", site: "Site") -> None:
-    floor = site.floor(sleep_s=1.5)
+    floor = site.floor(sleep_s=2.5)
     _, running = site.upload(floor)
     site.wait_running(running)
     _, waiting = site.upload(floor)
@@ -164,7 +163,7 @@ def test_a_job_cancelled_while_waiting_never_starts(crew: "Crew", site: "Site") 
 
 
 def test_a_floor_deleted_while_it_is_fitted_troubles_nobody(crew: "Crew", site: "Site") -> None:
-    floor = site.floor(sleep_s=1.0)
+    floor = site.floor(sleep_s=2.5)
     _, job_id = site.upload(floor)
     site.wait_running(job_id)
     with site.sessions.begin() as session:
@@ -177,7 +176,7 @@ def test_a_floor_deleted_while_it_is_fitted_troubles_nobody(crew: "Crew", site: 
 
 
 def test_a_job_cancelled_in_the_engine_by_an_operator_does_not_stay_open(crew: "Crew", site: "Site") -> None:
-    floor = site.floor(sleep_s=1.0)
+    floor = site.floor(sleep_s=8.0)
     _, running = site.upload(floor)
     site.wait_running(running)
     client = open_client(site.engine)
@@ -188,20 +187,15 @@ def test_a_job_cancelled_in_the_engine_by_an_operator_does_not_stay_open(crew: "
     assert site.wait(site.upload(floor)[1]).status == "successful"
 
 
-@pytest.mark.slow
-def test_a_running_job_whose_record_in_the_engine_is_lost_is_done_anew(crew: "Crew", site: "Site") -> None:
-    """The fit that was at work on it is stopped long before."""
-    floor = site.floor(sleep_s=5.0)
+def test_a_running_job_whose_record_in_the_engine_is_lost_goes_on(crew: "Crew", site: "Site") -> None:
+    floor = site.floor(sleep_s=4.0)
     _, job_id = site.upload(floor)
     site.wait_running(job_id)
     client = open_client(site.engine)
     client.delete_workflows([site.job(job_id).workflow_id])
     client.destroy()
-    job = site.wait(job_id, patience_s=2 * LOST_S)
-    assert job.status == "successful"
-    *stopped, last = [entry["at"] for entry in crew.diary(event="fit starts", map_id=job.map_id)]
-    assert last - stopped[-1] > LOST_S / 2
-    assert len(crew.diary(event="fit ends", map_id=job.map_id)) == 1
+    assert site.wait(job_id).status == "successful"
+    assert len(crew.diary(event="fit starts", floor_id=floor.id)) == 1
 
 
 def test_the_workers_log_says_nothing_untoward(crew: "Crew") -> None:

@@ -19,6 +19,7 @@ JSON_WITHOUT_BLOBS = {
     "building.anchor", "floor.outline", "calibration.model", "calibration.fit", "calibration.reference",
     "survey.report", "survey.excluded_s", "map.spec", "map.survey_ids", "map.bounds_m", "map.hyperparameters",
     "map.score", "track.waiting", "track.gaps", "track_steps.settled",
+    "job.plan",          # every hash in it is held while the job is in hand (`carried_by_jobs`)
     "job.result",        # the hash of a grid that its map names too; maps are never removed
     "idempotency.body",  # an answer as it was once given
 }  # fmt: skip
