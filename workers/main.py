@@ -38,6 +38,7 @@ from workers.workflows import WorkflowContext, register_workflows
 __all__ = ["run_worker"]
 
 FENCED = 3
+RESUMED_POLL_S = 10.0
 
 log = logging.getLogger(__name__)
 
@@ -105,6 +106,8 @@ def _launch(engine: Engine, worker_id: str, fits_at_one_time: int, context: Work
     job_engine = DBOS(config=engine_configuration(engine.url, worker_id))
     DBOS.listen_queues([])  # our slots do
     DBOS.launch()
+    # Where an operator's `resume` puts a job; nothing of ours waits there, and to look takes as long as for our queue.
+    job_engine._registry.get_internal_queue()._polling_interval_sec = RESUMED_POLL_S
     queue = DBOS.register_queue(
         QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=POLL_S
     )

@@ -93,6 +93,7 @@ class JobRun:
         self._context, self._workflow_id, self._generation = context, workflow_id, generation
         self._fencing_token = new_id()
         self._traceparent: str | None = None
+        self._claimed = False
 
     def run(self) -> str:
         """From claim to end, which is published, failed, cancelled, or skipped: it is, or was, somebody else's."""
@@ -101,6 +102,7 @@ class JobRun:
                 claimed = _patiently(self.claim)
             if not isinstance(claimed, Claim):
                 return claimed
+            self._claimed = True
             with self._step("fit"):
                 result = self._fit(claimed)
             with self._step("publish"):
@@ -116,9 +118,8 @@ class JobRun:
     def claim(self) -> Claim | str:
         """From here on uploads ask for the next generation, and this one sees all that came before.
 
-        How the job ended, where it has, or cannot begin. Raises NotFound where it is gone.
+        How the job ended, where it has. Raises IsodynError where it cannot be built.
         """
-        builder = self._context.builder
         with self._context.sessions.begin() as session:
             job = locked_job(session, self._workflow_id)
             self._traceparent = job.traceparent
@@ -126,17 +127,15 @@ class JobRun:
             link_to(job.traceparent)
             if job.status in FINAL_STATES:
                 return "skipped"
-            was_claimed, job.fencing_token = job.status == "running", self._fencing_token
+            was_claimed = job.status == "running"
             claim_generation(session, job.floor_id, self._generation)
             if job.cancel_requested:
                 return self._end(session, job, "cancelled")
-            if not was_claimed or job.plan is None:  # none where a worker of an older version claimed it
-                try:
-                    with session.begin_nested():
-                        job.plan = builder.claim_build(session, job.id)
-                except IsodynError as error:
-                    return self._end(session, job, "failed", str(error))
-            return Claim(job.id, job.plan, live_slots(session) > 1, was_claimed)
+            # An older version claimed without leaving a plan here.
+            plan = job.plan if was_claimed else None
+            plan = plan or self._context.builder.claim_build(session, job.id)
+            job.plan, job.fencing_token = plan, self._fencing_token
+            return Claim(job.id, plan, live_slots(session) > 1, was_claimed)
 
     def publish(self, plan: Plan, result: Result) -> str:
         """How it ended: published, or skipped where the job is not ours any more."""
@@ -153,10 +152,13 @@ class JobRun:
         """Give the job its last state, unless it is somebody else's."""
         with self._context.sessions.begin() as session:
             job = locked_job(session, self._workflow_id)
-            if job.status == "running" and job.fencing_token != self._fencing_token:
+            if not self._may_close(job):
                 return "skipped"
             claim_generation(session, job.floor_id, self._generation)
             return self._end(session, job, ended, message)
+
+    def _may_close(self, job: Job) -> bool:
+        return job.fencing_token == self._fencing_token or not (self._claimed or job.plan)
 
     def _end(self, session: Session, job: Job, ended: str, message: str = "") -> str:
         if ended == "cancelled":

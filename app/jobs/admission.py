@@ -23,6 +23,8 @@ HIGH, NORMAL, LOW = 1, 2, 3
 IN_HAND = or_(Job.status == "running", (Job.status == "accepted") & Job.admitted_at.is_not(None))
 """Jobs that the engine has: as many as there are slots, however many wait."""
 
+_FLOORS_IN_HAND = select(Job.organisation_id, Job.floor_id).where(IN_HAND)
+_LIVE_SLOTS = select(Worker.slots).where(Worker.state == "live")
 _ADMITTED = select(Job.id).where(Job.status == "accepted", Job.admitted_at.is_not(None)).limit(1)
 
 LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
@@ -45,7 +47,7 @@ def admit_next(session: Session) -> list[Job]:
     """
     lock_for_transaction(session, ADMISSION_LOCK)
     session.flush()
-    in_hand = session.execute(select(Job.organisation_id, Job.floor_id).where(IN_HAND)).all()
+    in_hand = session.execute(_FLOORS_IN_HAND).all()
     room = live_slots(session) - len(in_hand)
     if room <= 0:
         return []
@@ -75,7 +77,7 @@ def has_admitted(session: Session) -> bool:
 
 def live_slots(session: Session) -> int:
     """Jobs that the live workers run at one time. One of an older version admits nobody: with it there, all are."""
-    slots = session.scalars(select(Worker.slots).where(Worker.state == "live")).all()
+    slots = session.scalars(_LIVE_SLOTS).all()
     return 2**31 if None in slots else sum(each for each in slots if each is not None)
 
 

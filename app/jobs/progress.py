@@ -2,8 +2,9 @@
 
 import logging
 import time
+from typing import cast
 
-from sqlalchemy import update
+from sqlalchemy import Table, update
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
@@ -25,7 +26,9 @@ class JobReporter:
 
         dropped: a chatty fit costs at most one small transaction a second, and a short one none.
         """
-        self._sessions, self.job_id, self._fencing_token = sessions, job_id, fencing_token
+        self._sessions, self._job_id = sessions, job_id
+        ours = Job.id == job_id, Job.status == "running", Job.fencing_token == fencing_token
+        self._mine = update(cast(Table, Job.__table__)).where(*ours).returning(Job.cancel_requested)
         self._interval_s, self._next_s = interval_s, time.monotonic() + interval_s
 
     def report(self, fraction: float, message: str) -> None:
@@ -35,17 +38,12 @@ class JobReporter:
         """
         if time.monotonic() < self._next_s:
             return
-        statement = (
-            update(Job)
-            .where(Job.id == self.job_id, Job.status == "running", Job.fencing_token == self._fencing_token)
-            .values(progress=round(100 * min(max(fraction, 0.0), 1.0)), message=message)
-            .returning(Job.cancel_requested)
-        )
+        statement = self._mine.values(progress=round(100 * min(max(fraction, 0.0), 1.0)), message=message)
         try:
             with self._sessions.begin() as session:
                 cancelled = session.scalar(statement)
         except DBAPIError:  # hours of work must not end because a report could not be written
-            log.warning("progress of job %s could not be written", self.job_id, exc_info=True)
+            log.warning("progress of job %s could not be written", self._job_id, exc_info=True)
             cancelled = False
         if cancelled is not False:
             raise JobCancelled("the job was asked to stop, or is somebody else's")

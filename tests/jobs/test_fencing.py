@@ -10,6 +10,8 @@ from sqlalchemy.orm import undefer
 
 from app.blobs import open_blob_store
 from app.db.tables import Floor, Job, Map
+from app.errors import JobCancelled
+from app.jobs.queue import locked_job
 from workers.builder import load_builder
 from workers.slots import Slots
 from workers.workflows import Claim, JobRun, WorkflowContext
@@ -90,6 +92,23 @@ def test_a_zombie_runs_to_its_end_and_leaves_the_job_to_the_heir(
     monkeypatch.setattr(zombie, "publish", late)
     assert zombie.run() == "skipped"
     assert job_of(site, workflow_id).status == "running"
+
+
+def test_a_zombie_does_not_end_a_job_that_waits_anew(
+    site: "Site", context: WorkflowContext, workflow_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zombie = JobRun(context, workflow_id, 1)
+
+    def late(plan: dict[str, object], result: dict[str, object]) -> str:
+        with site.sessions.begin() as session:
+            site.queue.enqueue_again(session, locked_job(session, workflow_id), "its record was lost")
+        raise JobCancelled("it is not yours any more")
+
+    monkeypatch.setattr(zombie, "publish", late)
+    assert zombie.run() == "skipped"
+    job = job_of(site, workflow_id)
+    assert (job.status, job.fencing_token, job.plan) == ("accepted", None, None)
+    assert JobRun(context, workflow_id, 1).run() == "published"
 
 
 def test_a_job_that_was_cancelled_while_its_worker_was_dead_ends(
