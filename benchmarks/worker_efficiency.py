@@ -2,9 +2,10 @@
 
 Run: python benchmarks/worker_efficiency.py [DATABASE_URL] [--workers 4] [--jobs 60] [--cost 0.5]. Default: SQLite in
 a temporary folder. A job spins `cost` seconds of CPU in its fit's process. This file is also the builder that workers
-load. Shares are of the core seconds that others on the machine left. What a job adds is how many of them went by for
-each job beyond its cost: work of workers and idle cores alike. With as many workers as cores nothing hides the time
-between two fits of a slot, which is printed too.
+load. Shares are of the core seconds that others on the machine left, from when each worker has ended a job until the
+last jobs run, when cores idle for want of jobs. What a job adds is how many of them went by for each job beyond its
+cost: work of workers, what its fit's process does besides, and idle cores. With as many workers as cores nothing hides
+the time between two fits of a slot, which is printed too.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.engine import create_database_engine, migrate, session_factory
@@ -145,6 +146,16 @@ class Installation:
                     return [job.result for job in jobs if job.result is not None]
             time.sleep(0.25)
 
+    def wait_for(self, ids: list[str], count: int) -> int:
+        """Until so many of the jobs have ended: how many have."""
+        ended = select(func.count()).where(Job.id.in_(ids), Job.status.in_(FINAL_STATES))
+        while True:
+            with self.sessions() as session:
+                found = session.scalar(ended) or 0
+            if found >= count:
+                return found
+            time.sleep(0.1)
+
     def close(self) -> None:
         self.dismiss()
         self.queue.close()
@@ -171,6 +182,11 @@ def cpu_s(pids: list[int], children: bool = True) -> float:
     return total / TICKS
 
 
+def children_s(pids: list[int]) -> float:
+    """CPU seconds of the children of processes."""
+    return cpu_s(pids) - cpu_s(pids, children=False)
+
+
 def gaps_s(runs: list[dict[str, float]]) -> list[float]:
     """Seconds from the end of a fit to the start of the next in the same process."""
     of_process: dict[float, list[dict[str, float]]] = {}
@@ -183,7 +199,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("database_url", nargs="?")
     parser.add_argument("--workers", type=int, default=4)
-    parser.add_argument("--jobs", type=int, default=60)
+    parser.add_argument("--jobs", type=int, default=100)
     parser.add_argument("--cost", type=float, default=0.5)
     asked = parser.parse_args()
     cores = os.cpu_count() or 1
@@ -193,18 +209,24 @@ def main() -> None:
             installation.hire(asked.workers)
             installation.wait(installation.ask(asked.workers, 2.0))  # so long that each takes one, and has a warm child
             pids = [worker.pid for worker in installation.workers]
-            before = (*machine_s(), cpu_s(pids), time.time())
-            installation.wait(installation.ask(asked.jobs, asked.cost))
-            all_s, idle_s, ours_s, wall_s = (
-                now - was for now, was in zip((*machine_s(), cpu_s(pids), time.time()), before, strict=True)
+            ids = installation.ask(asked.jobs + 3 * asked.workers, asked.cost)
+            at_first = children_s(pids)
+            ended = installation.wait_for(ids, asked.workers)
+            before = (*machine_s(), cpu_s(pids), children_s(pids), time.time())
+            jobs = installation.wait_for(ids, asked.jobs + asked.workers) - ended
+            all_s, idle_s, ours_s, fits_s, wall_s = (
+                now - was
+                for now, was in zip((*machine_s(), cpu_s(pids), children_s(pids), time.time()), before, strict=True)
             )
-            left_s = all_s + idle_s - (all_s - ours_s)
-            worked = asked.jobs * asked.cost / left_s
-            print(f"{asked.workers} workers, {cores} cores, {asked.jobs} jobs of {asked.cost:.2f} s CPU each: "
+            installation.wait(ids)
+            besides_s = (children_s(pids) - at_first) / len(ids) - asked.cost  # that a fit's process does for a job
+            left_s = ours_s + idle_s
+            worked = (fits_s - jobs * besides_s) / left_s
+            print(f"{asked.workers} workers, {cores} cores, {jobs} jobs of {asked.cost:.2f} s CPU each: "
                   f"{wall_s:.1f} s; others took {100 * (1 - left_s / (all_s + idle_s)):.0f} %")  # fmt: skip
             print(f"of the rest: fits {100 * worked:.1f} %, workers {100 * (ours_s / left_s - worked):.1f} %, "
                   f"idle {100 * idle_s / left_s:.1f} %")  # fmt: skip
-            added_s = left_s / asked.jobs - asked.cost
+            added_s = (left_s - fits_s) / jobs + besides_s
             print(f"a job adds to its cost             {1000 * added_s:6.0f} ms")
             installation.dismiss()
 

@@ -5,6 +5,7 @@ time, and leaves what is unfinished to be taken over at once. Fenced (its lease 
 the others notice when its lease runs out.
 """
 
+import gc
 import logging
 import os
 import signal
@@ -79,6 +80,8 @@ def run_worker(
     _start_thread("helper", Helper(context, lease.worker_id).run, stop)
     upkeep = Upkeep(client, context.sessions, blobs, settings.job_history_days, settings.track_history_days)
     _start_thread("upkeep", upkeep.run, stop)
+    gc.collect()
+    gc.freeze()  # what is there now stays: a collection that walks through it takes as long as a job's statements
     parent_died = _wait(stop, parent_pid)
     context.slots.close()
     _leave(lease, client, 0.0 if parent_died else drain_s)

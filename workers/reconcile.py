@@ -4,10 +4,10 @@ which it has no record."""
 import logging
 import time
 from contextlib import suppress
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 
 from dbos import DBOSClient
-from sqlalchemy import select
+from sqlalchemy import or_, select
 
 from app.db.tables import Job
 from app.errors import NotFound
@@ -25,6 +25,7 @@ ABANDONED = {
 }
 
 LOST_S = 60.0  # whoever is at work on one may end it meanwhile
+SETTLED_S = 5.0  # most jobs that are younger end by themselves, and to look for their records costs
 
 log = logging.getLogger(__name__)
 
@@ -43,14 +44,15 @@ class Reconciler:
     worker that is still at one has lost it from then on, and sees so at its next report.
     """
 
-    def __init__(self, lost_s: float = LOST_S) -> None:
-        self._lost_s = lost_s
+    def __init__(self, lost_s: float = LOST_S, settled_s: float = SETTLED_S) -> None:
+        self._lost_s, self._settled = lost_s, timedelta(seconds=settled_s)
         self._since: dict[tuple[str, datetime | None], float] = {}
 
     def look(self, client: DBOSClient, context: WorkflowContext) -> None:
         """End what was given up, and let wait anew what has been lost for so long."""
+        settled = or_(Job.admitted_at < datetime.now(UTC) - self._settled, Job.admitted_at.is_(None))
         with context.sessions() as session:
-            in_hand = session.execute(select(Job.workflow_id, Job.id, Job.admitted_at).where(IN_HAND)).all()
+            in_hand = session.execute(select(Job.workflow_id, Job.admitted_at).where(IN_HAND, settled)).all()
         known = {}  # asked for later than the jobs: a job and its record are of one transaction
         if in_hand:
             names = [row.workflow_id for row in in_hand]

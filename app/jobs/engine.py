@@ -44,6 +44,7 @@ def engine_configuration(url: URL, executor_id: str) -> DBOSConfig:
         executor_id=executor_id,
         serializer=DBOSPortableJSONSerializer(),
         run_migrations=False,
+        db_engine_kwargs={"pool_pre_ping": False},  # it tries again itself where a connection has died
         use_listen_notify=False,  # nobody waits for its events, and telling of them wakes a thread every 10 ms
         notification_listener_polling_interval_sec=0.25,  # how long its end may take
         log_level="WARNING",

@@ -16,7 +16,7 @@ from app.jobs import JobQueue
 from app.jobs.admission import HIGH, LOW, NORMAL
 from app.jobs.engine import APPLICATION_VERSION, QUEUE, open_client
 from workers.builder import DEFAULT_BUILDER, load_builder
-from workers.reconcile import Reconciler
+from workers.reconcile import LOST_S, Reconciler
 from workers.slots import Slots
 from workers.workflows import WorkflowContext
 
@@ -186,7 +186,7 @@ def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(site: "Site",
     client = open_client(engine)
     client.cancel_workflow(site.job(given_up).workflow_id)
     before = ended()
-    reconciler = Reconciler()
+    reconciler = Reconciler(settled_s=0.0)
     for _ in range(2):
         reconciler.look(client, context_of(site))
     client.destroy()
@@ -209,7 +209,7 @@ def test_a_job_whose_record_in_the_engine_is_lost_waits_anew_once(
         session.get_one(Map, job.map_id).status = status
     sound_since = site.job(sound).admitted_at
     client = open_client(engine)
-    patient, first, second = Reconciler(), Reconciler(0.0), Reconciler(0.0)
+    patient, first, second = (Reconciler(lost_s, 0.0) for lost_s in (LOST_S, 0.0, 0.0))
     client.delete_workflows([job.workflow_id])
     patient.look(client, context_of(site))
     assert site.job(lost).status == status, "whoever is at work on it is given time to notice"
