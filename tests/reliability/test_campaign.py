@@ -7,7 +7,7 @@ import pytest
 from tests.reliability.campaign import run_campaign
 from tests.reliability.installation import BackEnd, installation
 
-UPLOADS = 18
+UPLOADS = 12
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ def test_surveys_and_windows_that_are_almost_right(tmp_path: Path) -> None:
     with installation("sqlite", tmp_path, 0.0) as site:
         site.start(apis=1, workers=1)
         with httpx.Client(base_url=site.addresses[0], headers={"Authorization": f"Bearer {KEY}"}, timeout=120) as http:
-            statuses = fuzz_inputs(http, mapped_floor(http), 150)
+            statuses = fuzz_inputs(http, mapped_floor(http), 80)
         assert site.apis[0].restarts == 0, site.logs()
         assert rss_mib(site.apis[0].pid) < 2000
     for expected in ("surveys 202", "surveys 422", "locate 200", "locate 422"):
