@@ -13,7 +13,7 @@ from app.blobs import open_blob_store
 from app.errors import JobCancelled, Unavailable
 from app.jobs.tile_chunks import Chunk, bring_chunk, take_chunk
 from app.telemetry.facts import with_facts
-from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
+from workers.fit_process import FitFailed, FitProcessDied
 from workers.workflows import WorkflowContext
 
 __all__ = ["Helper"]
@@ -34,7 +34,6 @@ class Helper:
 
     context: WorkflowContext
     worker_id: str
-    _fits: FitProcesses = field(default_factory=FitProcesses)
     _helping: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _not_before_s: float = 0.0
@@ -48,9 +47,6 @@ class Helper:
                     self._free()
                     break
                 threading.Thread(target=self._help, args=(chunk, stop), name="helping", daemon=True).start()
-            if self._is_wanted():  # by a job, which wants the memory, too
-                self._fits.close()
-        self._fits.close()
 
     def _reserve(self) -> bool:
         with self._lock:
@@ -99,7 +95,7 @@ class Helper:
                 raise JobCancelled("a job wants the slot")
 
         try:
-            result = self._fits.run(context.builder_name, work, context.blob_url, give_way, silence_s=MAX_SILENCE_S)
+            result = context.fits.run(context.builder_name, work, context.blob_url, give_way, silence_s=MAX_SILENCE_S)
             fits_sha256 = result.get("fits_sha256")
             if fits_sha256 is not None:
                 with context.sessions.begin() as session:

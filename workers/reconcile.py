@@ -38,10 +38,11 @@ def has_unfinished_jobs(client: DBOSClient, worker_id: str) -> bool:
 
 
 class Reconciler:
-    """Ends jobs that the engine gave up, and lets those wait anew of which it has no record: it was deleted by hand,
+    """Ends jobs that the engine gave up, and lets those wait anew of which it has no record.
 
-    or one of the two schemas was restored. Nobody else would, and their slots and floors would be taken for ever. A
-    worker that is still at one has lost it from then on, and sees so at its next report.
+    A record was deleted by hand, or one of the two schemas was restored. Nobody else would end these jobs, and their
+    slots and floors would be taken for ever. A worker that is still at one has lost it from then on, and sees so at
+    its next report.
     """
 
     def __init__(self, lost_s: float = LOST_S, settled_s: float = SETTLED_S) -> None:

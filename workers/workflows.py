@@ -203,6 +203,7 @@ class JobRun:
                 if deaths == FIT_ATTEMPTS:
                     raise
                 log.warning("%s; trying again", error)
+                time.sleep(deaths)  # where memory ran out, others may give some back
             except Unavailable as error:
                 if not waits_s:
                     raise

@@ -22,19 +22,18 @@ class JobReporter:
     def __init__(
         self, sessions: sessionmaker[Session], job_id: str, fencing_token: str, interval_s: float = 1.0
     ) -> None:
-        """`fencing_token`: that of whoever reports. Reports closer together than `interval_s`, or to the start, are
-
-        dropped: a chatty fit costs at most one small transaction a second, and a short one none.
-        """
+        """`fencing_token`: of whoever reports. Reports closer together than `interval_s`, or to the start, are dropped,
+        so a chatty fit costs at most one small transaction a second, and a short one none."""
         self._sessions, self._job_id = sessions, job_id
         ours = Job.id == job_id, Job.status == "running", Job.fencing_token == fencing_token
         self._mine = update(cast(Table, Job.__table__)).where(*ours).returning(Job.cancel_requested)
         self._interval_s, self._next_s = interval_s, time.monotonic() + interval_s
 
     def report(self, fraction: float, message: str) -> None:
-        """Show that `fraction` (0 to 1) is done. Raises JobCancelled if a cancel was requested, or the job is not ours
+        """Show that `fraction` (0 to 1) is done.
 
-        any more: it ended, was given to another worker, or is gone.
+        Raises JobCancelled if a cancel was requested, or the job is not ours any more: it ended, was given to another
+        worker, or is gone.
         """
         if time.monotonic() < self._next_s:
             return

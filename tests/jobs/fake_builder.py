@@ -67,7 +67,7 @@ def claim_build(session: Session, job_id: str) -> dict[str, Any]:
 def fit_build(
     plan: dict[str, Any], blobs: BlobStore, progress: Callable[[float, str], None], board: Board | None
 ) -> dict[str, Any]:
-    note("fit starts", floor_id=plan["floor_id"], map_id=plan["map_id"], surveys=plan["surveys"])
+    note("fit starts", floor_id=plan["floor_id"], map_id=plan["map_id"], surveys=plan["surveys"], worker=os.getppid())
     if plan.get("fail"):
         raise InvalidInput("the walks do not overlap; walk the floor again")
     if plan.get("break"):
