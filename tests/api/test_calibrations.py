@@ -308,6 +308,7 @@ def test_scopes(service: Any, key_with: Callable[..., dict[str, str]]) -> None:
         assert service.http.get("/v1/calibrations", headers=key_with(scope)).status_code == 200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)  # half a minute that no database has a part in
 def test_a_phone_is_calibrated_by_a_walk_nobody_told_the_way_of(
     service: Any, building: str, mapped_floor: str, walked: Any

@@ -264,6 +264,9 @@ def test_an_older_build_never_replaces_a_newer_one(
     assert results[0]["grid_sha256"] == results[1]["grid_sha256"], "the same surveys give the same map"
 
 
+@pytest.mark.parametrize(
+    "database_url", ["sqlite", pytest.param("postgres", marks=[pytest.mark.postgres, pytest.mark.slow])], indirect=True
+)
 def test_a_compromise_map_on_request_says_how_near_it_is(service: Any, mapped_floor: str) -> None:
     body = {"engine": "compromise", "components": "norm", "activate": False, "resolution_m": 0.5}
     asked = service.http.post(f"/v1/floors/{mapped_floor}/maps", json=body)

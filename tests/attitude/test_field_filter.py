@@ -111,6 +111,7 @@ def test_the_magnitude_is_a_filter_of_its_own():
     assert len(log.events) == 1
 
 
+@pytest.mark.slow
 def test_rates_of_outliers_are_nominal_with_rotated_noise_and_below_it_with_fixed():
     """0.27 +- 0.1 % with R = J R J^T; the sensor's noise is not the same along all axes (Brommer, Table IV)."""
     shares = {}

@@ -111,6 +111,7 @@ def test_rougher_kernels_are_about_as_good(building, at_one_height, plain, kerne
     assert 0.88 < covered(rough, building, 1.2) < 0.995
 
 
+@pytest.mark.slow
 def test_a_field_longer_than_the_boxes_is_not_taken_for_offsets(building):
     """A quarter of a survey's readings are its own constant: the others still tell the field."""
     rng, walks = np.random.default_rng(5), {}

@@ -69,6 +69,7 @@ def test_wrong_labels_are_corrected_and_the_map_comes_nearer_to_the_truth(make_r
     assert refined.score.rmse_vec_ut > 0.8 * plain.score.rmse_vec_ut  # labels that judge are as wrong as before
 
 
+@pytest.mark.slow
 def test_walks_in_a_weak_field_stay_as_they_are(room):
     strong = room.lanes(np.random.default_rng(1), surveys=5, lane_m=2.5, noise_uT=0.0)
     walks, _ = with_wrong_labels(faint(strong, share=0.05), sd_m=0.35)

@@ -95,6 +95,9 @@ def test_a_cancelled_job_of_a_killed_worker_is_not_done_again(crew: "Crew", site
     assert site.wait(job_id).status == "dismissed"
 
 
+@pytest.mark.parametrize(
+    "database_url", ["sqlite", pytest.param("postgres", marks=[pytest.mark.postgres, pytest.mark.slow])], indirect=True
+)
 def test_asked_to_stop_a_worker_finishes_its_job_first(crew: "Crew", site: "Site") -> None:
     floor = site.floor(sleep_s=3.0)
     worker = crew.hire(drain_s=20.0)

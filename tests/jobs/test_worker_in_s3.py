@@ -53,6 +53,7 @@ def test_a_fit_waits_for_its_blobs(crew: "Crew", site: "Site", way: Way) -> None
     assert job.result == {"sha256": blob.sha256}
 
 
+@pytest.mark.slow
 def test_a_fit_that_waits_can_be_cancelled(crew: "Crew", site: "Site", way: Way) -> None:
     way.cut()
     _, job_id = site.upload(site.floor(sleep_s=0.1))

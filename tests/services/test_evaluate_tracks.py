@@ -275,6 +275,7 @@ def test_rows_are_put_together_step_by_step():
     assert rows.t_s[2] == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 def test_a_known_building_is_followed_end_to_end(building, tmp_path):
     report, picture = tmp_path / "tracks.json", tmp_path / "tracks.png"
     result = CliRunner().invoke(

@@ -161,6 +161,9 @@ def test_a_restart_goes_on_as_if_there_was_none(
     )
 
 
+@pytest.mark.parametrize(
+    "database_url", ["sqlite", pytest.param("postgres", marks=[pytest.mark.postgres, pytest.mark.slow])], indirect=True
+)
 def test_two_processes_on_one_track_notice_each_other(world: World, hall_steps: Callable[..., Steps]) -> None:
     steps = hall_steps(count=200)
     alone, shared = world.new_track(), world.new_track()

@@ -35,6 +35,7 @@ def test_figures_of_drawn_errors():
     assert found.rank_correlation.value > 0.1
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_repetitions():
     rng = np.random.default_rng(1)
     repeated = [score_map(walks(rng)) for _ in range(30)]
