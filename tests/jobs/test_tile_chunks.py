@@ -178,9 +178,6 @@ def test_a_helper_that_fails_leaves_the_chunks_to_others(
     assert 1 <= len(board.taken()) <= 2  # one a slot
 
 
-@pytest.mark.parametrize(
-    "database_url", ["sqlite", pytest.param("postgres", marks=[pytest.mark.postgres, pytest.mark.slow])], indirect=True
-)
 @pytest.mark.parametrize("database_url", [pytest.param("postgres", marks=pytest.mark.postgres)], indirect=True)
 def test_a_worker_with_a_free_slot_helps_and_its_end_costs_no_job(crew: "Crew", site: "Site") -> None:
     crew.environment["ISODYN_WORKER_PROCESSES"] = "1"
