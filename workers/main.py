@@ -34,11 +34,10 @@ from workers.reaper import Reaper
 from workers.reconcile import has_unfinished_jobs
 from workers.slots import POLL_S, Slots
 from workers.upkeep import Upkeep
-from workers.workflows import WorkflowContext, register_workflows
+from workers.workflows import FENCED, WorkflowContext, register_workflows
 
 __all__ = ["run_worker"]
 
-FENCED = 3
 RESUMED_POLL_S = 10.0
 
 log = logging.getLogger(__name__)
@@ -66,12 +65,13 @@ def run_worker(
     blobs = open_blob_store(settings.resolved_blob_url)  # makes its folder: no fit does
     engine = create_database_engine(url)
     client = open_client(engine)
+    worker_id = new_worker_id()
     context = WorkflowContext(
         session_factory(engine), JobQueue(engine), settings.resolved_blob_url, load_builder(builder), builder,
-        Slots(settings.worker_processes),
+        Slots(settings.worker_processes), worker_id,
     )  # fmt: skip
     register_workflows(context)
-    lease = Lease(engine, new_worker_id(), lease_ttl_s, slots=settings.worker_processes)
+    lease = Lease(engine, worker_id, lease_ttl_s, slots=settings.worker_processes)
     lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)
@@ -84,7 +84,7 @@ def run_worker(
     gc.freeze()  # what is there now stays: a collection that walks through it takes as long as a job's statements
     parent_died = _wait(stop, parent_pid)
     context.slots.close()
-    _leave(lease, client, 0.0 if parent_died else drain_s)
+    _leave(lease, client, context.slots, 0.0 if parent_died else drain_s)
     context.fits.close()
     lifeline.release()
     engine.dispose()
@@ -114,13 +114,15 @@ def _launch(engine: Engine, worker_id: str, fits_at_one_time: int, context: Work
     queue = DBOS.register_queue(
         QUEUE, partition_concurrency=1, worker_concurrency=fits_at_one_time, polling_interval_sec=POLL_S
     )
+    queue._worker_concurrency = fits_at_one_time  # and not what somebody wrote there meanwhile
     queue.database_backed_queue = False  # its row is shared, and read before every poll; each worker has its own slots
 
     def is_wanted() -> bool:
         try:
             with context.sessions() as session:
                 return has_admitted(session)
-        except SQLAlchemyError:  # the engine's own poll says so
+        except Exception:  # whatever it was: a worker that does not look takes no jobs
+            log.warning("could not look for jobs; the engine looks itself", exc_info=True)
             return True
 
     context.slots.fill(job_engine, queue, is_wanted)
@@ -142,13 +144,14 @@ def _wait(stop: threading.Event, parent_pid: int | None) -> bool:
     return False
 
 
-def _leave(lease: Lease, client: DBOSClient, drain_s: float) -> None:
+def _leave(lease: Lease, client: DBOSClient, slots: Slots, drain_s: float) -> None:
     """Take nothing new, let running jobs finish, and leave the rest to the others."""
     try:
-        busy = has_unfinished_jobs(client, lease.worker_id)
+        busy = slots.are_used or has_unfinished_jobs(client, lease.worker_id)
         DBOS.destroy(workflow_completion_timeout_sec=ceil(drain_s) if busy else 0)
         unfinished = has_unfinished_jobs(client, lease.worker_id)
         lease.release(unfinished=unfinished)
+        unfinished |= slots.are_used  # by a job of which the engine has lost its record
     except SQLAlchemyError:
         log.exception("worker %s could not sign off; its lease will run out", lease.worker_id)
         unfinished = True

@@ -21,6 +21,7 @@ __all__ = ["Reconciler", "has_unfinished_jobs"]
 ABANDONED = {
     "CANCELLED": "cancelled in the job engine by an operator",
     "ERROR": "internal error in the worker; its log has the trace",
+    "SUCCESS": "ended in the job engine without a result here; ask for it again",
     "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "given up: its worker died every time it was tried; see the log of the worker",
 }
 

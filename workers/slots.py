@@ -27,7 +27,8 @@ class Slots(threading.Event):
     def __init__(self, count: int) -> None:
         """`count`: the jobs that run at one time."""
         super().__init__()
-        self._free, self._ended, self._pause_s = count, False, FIRST_POLL_S
+        self._count, self._free = count, count
+        self._ended, self._pause_s = False, FIRST_POLL_S
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         self._is_wanted: Callable[[], bool] = lambda: True
@@ -36,6 +37,11 @@ class Slots(threading.Event):
     def free(self) -> int:
         """How many no job has."""
         return self._free
+
+    @property
+    def are_used(self) -> bool:
+        """Whether any job has one."""
+        return self._free < self._count
 
     def fill(self, engine: DBOS, queue: Queue, is_wanted: Callable[[], bool]) -> None:
         """Take jobs from the queue from now on; the engine must not listen to it.

@@ -6,6 +6,7 @@ has that token, in one transaction: who lost a job without knowing it cannot spo
 """
 
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from typing import TypeVar
 from dbos import DBOS
 from opentelemetry import trace
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.blobs import open_blob_store
@@ -31,8 +33,9 @@ from workers.builder import Builder, Plan, Result
 from workers.fit_process import FitFailed, FitProcessDied, FitProcesses
 from workers.slots import Slots
 
-__all__ = ["Claim", "JobRun", "WorkflowContext", "register_workflows"]
+__all__ = ["FENCED", "Claim", "Fenced", "JobRun", "WorkflowContext", "register_workflows"]
 
+FENCED = 3  # the exit code of a worker that others took for dead
 FIT_ATTEMPTS = 3
 WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0)  # for what cannot be reached: two minutes in all
 MOST_RECOVERIES = 5  # a job that takes its worker down with it must not do so for ever
@@ -53,6 +56,7 @@ class WorkflowContext:
     builder: Builder
     builder_name: str
     slots: Slots
+    worker_id: str
     fits: FitProcesses = field(default_factory=FitProcesses)
 
 
@@ -61,7 +65,11 @@ def register_workflows(context: WorkflowContext) -> None:
 
     def run(workflow_id: str, generation: int) -> str:
         with with_facts(workflow_id=workflow_id), context.slots.taken():
-            ended = JobRun(context, workflow_id, generation).run()
+            try:
+                ended = JobRun(context, workflow_id, generation).run()
+            except Fenced:
+                log.error("worker %s was declared dead and ends: others may hold its jobs", context.worker_id)
+                os._exit(FENCED)
             JOBS_ENDED.labels(REBUILD if workflow_id.startswith(f"{REBUILD}:") else BUILD, ended).inc()
             log.info("the job ended: %s", ended)
             return ended
@@ -73,6 +81,10 @@ def register_workflows(context: WorkflowContext) -> None:
     @DBOS.workflow(name=BUILD, max_recovery_attempts=MOST_RECOVERIES)
     def build(map_id: str) -> str:
         return run(f"{BUILD}:{map_id}", 0)
+
+
+class Fenced(BaseException):
+    """This worker was declared dead, and does not know it yet. The engine must record nothing: the job is another's."""
 
 
 @dataclass(frozen=True)
@@ -97,12 +109,18 @@ class JobRun:
 
     def run(self) -> str:
         """From claim to end, which is published, failed, cancelled, or skipped: it is, or was, somebody else's."""
-        try:
-            with self._step("claim"):
+        with self._step("claim"):
+            try:
                 claimed = _patiently(self.claim)
-            if not isinstance(claimed, Claim):
-                return claimed
-            self._claimed = True
+            except IsodynError as error:
+                return self._close("failed", str(error))
+            except Exception:  # the engine notes an error, if the job is still ours there, and so ends it
+                log.exception("%s could not be claimed", self._workflow_id)
+                raise
+        if not isinstance(claimed, Claim):
+            return claimed
+        self._claimed = True
+        try:
             with self._step("fit"):
                 result = self._fit(claimed)
             with self._step("publish"):
@@ -118,13 +136,17 @@ class JobRun:
     def claim(self) -> Claim | str:
         """From here on uploads ask for the next generation, and this one sees all that came before.
 
-        How the job ended, where it has. Raises IsodynError where it cannot be built.
+        How the job ended, where it has. Raises IsodynError where it cannot be built, and Fenced where this worker was
+        declared dead: whoever then claims the job waits for the floor that is locked here, and comes after.
         """
         with self._context.sessions.begin() as session:
             job = locked_job(session, self._workflow_id)
             self._traceparent = job.traceparent
             add_facts(job_id=job.id, floor_id=job.floor_id, request_id=job.request_id)
             link_to(job.traceparent)
+            slots = live_slots(session)
+            if self._context.worker_id not in slots:
+                raise Fenced
             if job.status in FINAL_STATES:
                 return "skipped"
             was_claimed = job.status == "running"
@@ -135,30 +157,34 @@ class JobRun:
             plan = job.plan if was_claimed else None
             plan = plan or self._context.builder.claim_build(session, job.id)
             job.plan, job.fencing_token = plan, self._fencing_token
-            return Claim(job.id, plan, live_slots(session) > 1, was_claimed)
+            return Claim(job.id, plan, sum(slots.values()) > 1, was_claimed)
 
     def publish(self, plan: Plan, result: Result) -> str:
-        """How it ended: published, or skipped where the job is not ours any more."""
+        """How it ended: published, cancelled at the last moment, or skipped where the job is not ours any more."""
         with self._context.sessions.begin() as session:
             job = locked_job(session, self._workflow_id)
-            if job.status in FINAL_STATES or job.fencing_token != self._fencing_token:
+            if job.fencing_token == self._fencing_token and job.status == "successful":
+                return "published"  # before, but the answer was lost
+            if not self._holds(job):
                 return "skipped"
+            if job.cancel_requested:
+                return self._end(session, job, "cancelled")
             self._context.builder.publish_build(session, job.id, plan, result)
             job.plan = None
             self._context.queue.admit(session)
         return "published"
 
     def close(self, ended: str, message: str) -> str:
-        """Give the job its last state, unless it is somebody else's."""
+        """Give the job its last state, where it is ours, or was never anybody's."""
         with self._context.sessions.begin() as session:
             job = locked_job(session, self._workflow_id)
-            if not self._may_close(job):
+            if not (self._holds(job) or (job.status == "accepted" and not self._claimed)):
                 return "skipped"
             claim_generation(session, job.floor_id, self._generation)
             return self._end(session, job, ended, message)
 
-    def _may_close(self, job: Job) -> bool:
-        return job.fencing_token == self._fencing_token or not (self._claimed or job.plan)
+    def _holds(self, job: Job) -> bool:
+        return job.status == "running" and job.fencing_token == self._fencing_token
 
     def _end(self, session: Session, job: Job, ended: str, message: str = "") -> str:
         if ended == "cancelled":
@@ -223,7 +249,7 @@ def _patiently(call: Callable[[], R]) -> R:
     for wait_s in WAITS_S:
         try:
             return call()
-        except DBAPIError as error:
+        except (DBAPIError, PoolTimeout) as error:
             log.warning("a job waits %.0f s: %s", wait_s, error)
             time.sleep(wait_s)
     return call()

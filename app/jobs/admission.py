@@ -24,7 +24,7 @@ IN_HAND = or_(Job.status == "running", (Job.status == "accepted") & Job.admitted
 """Jobs that the engine has: as many as there are slots, however many wait."""
 
 _FLOORS_IN_HAND = select(Job.organisation_id, Job.floor_id).where(IN_HAND)
-_LIVE_SLOTS = select(Worker.slots).where(Worker.state == "live")
+_LIVE_SLOTS = select(Worker.id, Worker.slots).where(Worker.state == "live")
 _ADMITTED = select(Job.id).where(Job.status == "accepted", Job.admitted_at.is_not(None)).limit(1)
 
 LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
@@ -48,7 +48,7 @@ def admit_next(session: Session) -> list[Job]:
     lock_for_transaction(session, ADMISSION_LOCK)
     session.flush()
     in_hand = session.execute(_FLOORS_IN_HAND).all()
-    room = live_slots(session) - len(in_hand)
+    room = sum(live_slots(session).values()) - len(in_hand)
     if room <= 0:
         return []
     turns = _turns(session, room, {row.floor_id for row in in_hand})
@@ -75,10 +75,9 @@ def has_admitted(session: Session) -> bool:
     return session.scalar(_ADMITTED) is not None
 
 
-def live_slots(session: Session) -> int:
-    """Jobs that the live workers run at one time. One of an older version admits nobody: with it there, all are."""
-    slots = session.scalars(_LIVE_SLOTS).all()
-    return 2**31 if None in slots else sum(each for each in slots if each is not None)
+def live_slots(session: Session) -> dict[str, int]:
+    """By live worker, the jobs it runs at one time. One of an older version admits nobody: with it there, all are."""
+    return {row.id: 2**31 if row.slots is None else row.slots for row in session.execute(_LIVE_SLOTS)}
 
 
 def _turns(session: Session, room: int, busy_floors: set[str]) -> dict[str, _Turn]:

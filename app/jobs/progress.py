@@ -6,6 +6,7 @@ from typing import cast
 
 from sqlalchemy import Table, update
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session, sessionmaker
 
 from app.db.tables import Job
@@ -41,7 +42,7 @@ class JobReporter:
         try:
             with self._sessions.begin() as session:
                 cancelled = session.scalar(statement)
-        except DBAPIError:  # hours of work must not end because a report could not be written
+        except (DBAPIError, PoolTimeout):  # hours of work must not end because a report could not be written
             log.warning("progress of job %s could not be written", self._job_id, exc_info=True)
             cancelled = False
         if cancelled is not False:

@@ -70,7 +70,7 @@ def references(session: Session | Connection) -> References:
 
 
 def carried_by_jobs(session: Session, queue: JobQueue) -> frozenset[str]:
-    """Blobs that unfinished jobs hold in what the job engine keeps of them: read by a fit, or not yet published."""
+    """Blobs that unfinished jobs hold: what their plans name, and what workers tell each other."""
     recorded = frozenset(found for said in queue.recorded(session) for found in _hashes(said))
     return recorded.union(*(_plain(session, column) for column in IN_HAND))
 

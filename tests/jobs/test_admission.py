@@ -95,7 +95,7 @@ def test_without_a_worker_jobs_wait_in_our_table_only(site: "Site", hire: Hire, 
 
 def context_of(site: "Site") -> WorkflowContext:
     """What the reaper of a worker works with."""
-    return WorkflowContext(site.sessions, site.queue, "", load_builder(DEFAULT_BUILDER), DEFAULT_BUILDER, Slots(1))
+    return WorkflowContext(site.sessions, site.queue, "", load_builder(DEFAULT_BUILDER), DEFAULT_BUILDER, Slots(1), "w")
 
 
 def ended() -> float:
@@ -194,6 +194,22 @@ def test_however_many_wait_a_job_that_the_engine_gave_up_is_closed(site: "Site",
     assert ended() == before + 1
     admit(site)
     assert [job.id for job in in_hand(site)] == [waiting]
+
+
+def test_a_job_that_ended_in_the_engine_only_is_closed(site: "Site", hire: Hire, engine: Engine) -> None:
+    hire(1)
+    job_id = ask(site, site.floor(), NORMAL)
+    with site.sessions.begin() as session:
+        session.get_one(Job, job_id).status = "running"
+    schema = "dbos." if engine.dialect.name == "postgresql" else ""
+    with engine.begin() as connection:
+        ended = text(f"UPDATE {schema}workflow_status SET status = 'SUCCESS' WHERE workflow_uuid = :name")
+        connection.execute(ended, {"name": site.job(job_id).workflow_id})
+    client = open_client(engine)
+    Reconciler(settled_s=0.0).look(client, context_of(site))
+    client.destroy()
+    job = site.job(job_id)
+    assert (job.status, job.message) == ("failed", "ended in the job engine without a result here; ask for it again")
 
 
 @pytest.mark.parametrize("status", ["accepted", "running"])

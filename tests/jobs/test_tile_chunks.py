@@ -165,7 +165,7 @@ def test_a_helper_that_fails_leaves_the_chunks_to_others(
     monkeypatch.setenv("ISODYN_TEST_DIARY", str(tmp_path / "diary"))
     board.offer(blob_store.put(json.dumps({"floor_id": "f", "fail_chunk": True}).encode()), 40)
     builder, blob_url = load_builder(DEFAULT_BUILDER), f"file://{tmp_path / 'blobs'}"
-    context = WorkflowContext(site.sessions, site.queue, blob_url, builder, "tests.jobs.fake_builder", Slots(2))
+    context = WorkflowContext(site.sessions, site.queue, blob_url, builder, "tests.jobs.fake_builder", Slots(2), "w")
     stop = threading.Event()
     helping = threading.Thread(target=Helper(context, "somebody").run, args=(stop,))
     helping.start()
