@@ -26,6 +26,7 @@ ABANDONED = {
 }
 
 LOST_S = 60.0  # whoever is at work on one may end it meanwhile
+NEVER_BEGUN = "accepted", "PENDING"  # here, and in the engine
 SETTLED_S = 5.0  # most jobs that are younger end by themselves, and to look for their records costs
 
 log = logging.getLogger(__name__)
@@ -43,18 +44,21 @@ class Reconciler:
 
     A record was deleted by hand, or one of the two schemas was restored. Nobody else would end these jobs, and their
     slots and floors would be taken for ever. A worker that is still at one has lost it from then on, and sees so at
-    its next report.
+    its next report. So it goes with jobs that the engine gave to a worker which never heard so and begins none of them:
+    their records are deleted, and then they are lost.
     """
 
     def __init__(self, lost_s: float = LOST_S, settled_s: float = SETTLED_S) -> None:
         self._lost_s, self._settled = lost_s, timedelta(seconds=settled_s)
-        self._since: dict[tuple[str, datetime | None], float] = {}
+        self._since: dict[tuple[str, datetime | None, bool], float] = {}
 
     def look(self, client: DBOSClient, context: WorkflowContext) -> None:
         """End what was given up, and let wait anew what has been lost for so long."""
         settled = or_(Job.admitted_at < datetime.now(UTC) - self._settled, Job.admitted_at.is_(None))
         with context.sessions() as session:
-            in_hand = session.execute(select(Job.workflow_id, Job.admitted_at).where(IN_HAND, settled)).all()
+            in_hand = session.execute(
+                select(Job.workflow_id, Job.admitted_at, Job.status).where(IN_HAND, settled)
+            ).all()
         known = {}  # asked for later than the jobs: a job and its record are of one transaction
         if in_hand:
             names = [row.workflow_id for row in in_hand]
@@ -65,10 +69,20 @@ class Reconciler:
                 log.warning("%s ended in the job engine as %s", workflow_id, status)
                 _fail(context, workflow_id, ABANDONED[status])
         now_s = time.monotonic()
-        lost = [(row.workflow_id, row.admitted_at) for row in in_hand if row.workflow_id not in known]
+        unheard = {row.workflow_id for row in in_hand if (row.status, known.get(row.workflow_id)) == NEVER_BEGUN}
+        lost = [
+            (row.workflow_id, row.admitted_at, row.workflow_id in unheard)
+            for row in in_hand
+            if row.workflow_id in unheard or row.workflow_id not in known
+        ]
         self._since = {each: self._since.get(each, now_s) for each in lost}
-        for (workflow_id, admitted_at), since_s in self._since.items():
-            if now_s - since_s >= self._lost_s:
+        for (workflow_id, admitted_at, has_record), since_s in self._since.items():
+            if now_s - since_s < self._lost_s:
+                continue
+            if has_record:
+                log.warning("%s was given to a worker that never began it", workflow_id)
+                client.delete_workflows([workflow_id])
+            else:
                 _let_wait_anew(context, workflow_id, admitted_at)
 
 

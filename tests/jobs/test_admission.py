@@ -212,6 +212,25 @@ def test_a_job_that_ended_in_the_engine_only_is_closed(site: "Site", hire: Hire,
     assert (job.status, job.message) == ("failed", "ended in the job engine without a result here; ask for it again")
 
 
+def test_a_job_that_its_worker_never_heard_of_waits_anew(site: "Site", hire: Hire, engine: Engine) -> None:
+    """The engine's answer was lost on its way to the worker, which lives."""
+    hire(1)
+    job_id = ask(site, site.floor(), NORMAL)
+    schema = "dbos." if engine.dialect.name == "postgresql" else ""
+    with engine.begin() as connection:
+        given = text(f"UPDATE {schema}workflow_status SET status = 'PENDING' WHERE workflow_uuid = :name")
+        connection.execute(given, {"name": site.job(job_id).workflow_id})
+    client, patient, hasty = open_client(engine), Reconciler(settled_s=0.0), Reconciler(0.0, 0.0)
+    patient.look(client, context_of(site))
+    assert client.list_workflows(workflow_ids=[site.job(job_id).workflow_id], status="PENDING")
+    for _ in range(2):
+        hasty.look(client, context_of(site))
+    client.destroy()
+    assert site.job(job_id).admitted_at is None
+    admit(site)
+    assert known_to_the_engine(engine).count(site.job(job_id).workflow_id) == 1
+
+
 @pytest.mark.parametrize("status", ["accepted", "running"])
 def test_a_job_whose_record_in_the_engine_is_lost_waits_anew_once(
     site: "Site", hire: Hire, engine: Engine, status: str
