@@ -13,8 +13,8 @@ depends_on = None
 
 
 def upgrade() -> None:
-    op.add_column("job", sa.Column("fencing_token", sa.String(36)))
-    op.add_column("job", sa.Column("plan", sa.JSON()))
+    op.add_column("job", sa.Column("fencing_token", sa.String(36), nullable=True))
+    op.add_column("job", sa.Column("plan", sa.JSON(), nullable=True))
 
 
 def downgrade() -> None:
