@@ -1,4 +1,4 @@
-"""A real worker between organisations: the one with one walk is not kept waiting by the one with two hundred."""
+"""Real workers: each has its slots, and one walk is not kept waiting by another organisation's two hundred."""
 
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -10,6 +10,20 @@ from app.db.tables import Floor, Job
 
 if TYPE_CHECKING:
     from conftest import Crew, Site
+
+
+@pytest.mark.slow
+def test_each_worker_has_slots_of_its_own(crew: "Crew", site: "Site") -> None:
+    crew.environment["ISODYN_WORKER_PROCESSES"] = "1"
+    narrow = crew.hire()
+    site.wait_for_workers(1)
+    crew.environment["ISODYN_WORKER_PROCESSES"] = "3"
+    wide = crew.hire()
+    site.wait_for_workers(2)
+    jobs = [site.upload(floor)[1] for floor in site.floors(4, sleep_s=6.0)]
+    for job_id in jobs:
+        site.wait_running(job_id)
+    assert Counter(entry["worker"] for entry in crew.diary(event="fit starts")) == {narrow.pid: 1, wide.pid: 3}
 
 
 @pytest.mark.slow
@@ -28,17 +42,3 @@ def test_two_hundred_waiting_floors_of_another_organisation_are_no_obstacle(crew
     assert number - begun <= 1  # at most one that was admitted before it came
     with site.sessions() as session:
         assert len(session.scalars(select(Job.id).where(Job.status == "accepted")).all()) > 150
-
-
-@pytest.mark.slow
-def test_each_worker_has_slots_of_its_own(crew: "Crew", site: "Site") -> None:
-    crew.environment["ISODYN_WORKER_PROCESSES"] = "1"
-    narrow = crew.hire()
-    site.wait_for_workers(1)
-    crew.environment["ISODYN_WORKER_PROCESSES"] = "3"
-    wide = crew.hire()
-    site.wait_for_workers(2)
-    jobs = [site.upload(floor)[1] for floor in site.floors(4, sleep_s=6.0)]
-    for job_id in jobs:
-        site.wait_running(job_id)
-    assert Counter(entry["worker"] for entry in crew.diary(event="fit starts")) == {narrow.pid: 1, wide.pid: 3}
