@@ -83,6 +83,13 @@ def known_to_the_engine(engine: Engine) -> list[str]:
     return names
 
 
+def say_in_the_engine(engine: Engine, workflow_id: str, status: str) -> None:
+    schema = "dbos." if engine.dialect.name == "postgresql" else ""
+    with engine.begin() as connection:
+        said = text(f"UPDATE {schema}workflow_status SET status = :status WHERE workflow_uuid = :name")
+        connection.execute(said, {"status": status, "name": workflow_id})
+
+
 def test_without_a_worker_jobs_wait_in_our_table_only(site: "Site", hire: Hire, engine: Engine) -> None:
     (job_id,) = upload(site, [site.floor()])
     name = site.job(job_id).workflow_id
@@ -201,10 +208,7 @@ def test_a_job_that_ended_in_the_engine_only_is_closed(site: "Site", hire: Hire,
     job_id = ask(site, site.floor(), NORMAL)
     with site.sessions.begin() as session:
         session.get_one(Job, job_id).status = "running"
-    schema = "dbos." if engine.dialect.name == "postgresql" else ""
-    with engine.begin() as connection:
-        ended = text(f"UPDATE {schema}workflow_status SET status = 'SUCCESS' WHERE workflow_uuid = :name")
-        connection.execute(ended, {"name": site.job(job_id).workflow_id})
+    say_in_the_engine(engine, site.job(job_id).workflow_id, "SUCCESS")
     client = open_client(engine)
     Reconciler(settled_s=0.0).look(client, context_of(site))
     client.destroy()
@@ -216,10 +220,7 @@ def test_a_job_that_its_worker_never_heard_of_waits_anew(site: "Site", hire: Hir
     """The engine's answer was lost on its way to the worker, which lives."""
     hire(1)
     job_id = ask(site, site.floor(), NORMAL)
-    schema = "dbos." if engine.dialect.name == "postgresql" else ""
-    with engine.begin() as connection:
-        given = text(f"UPDATE {schema}workflow_status SET status = 'PENDING' WHERE workflow_uuid = :name")
-        connection.execute(given, {"name": site.job(job_id).workflow_id})
+    say_in_the_engine(engine, site.job(job_id).workflow_id, "PENDING")
     client, patient, hasty = open_client(engine), Reconciler(settled_s=0.0), Reconciler(0.0, 0.0)
     patient.look(client, context_of(site))
     assert client.list_workflows(workflow_ids=[site.job(job_id).workflow_id], status="PENDING")
