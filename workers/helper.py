@@ -33,7 +33,6 @@ class Helper:
     """One of a worker."""
 
     context: WorkflowContext
-    worker_id: str
     _helping: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _not_before_s: float = 0.0
@@ -65,7 +64,7 @@ class Helper:
     def _take(self) -> Chunk | None:
         try:
             with self.context.sessions.begin() as session:
-                return take_chunk(session, self.worker_id)
+                return take_chunk(session, self.context.worker_id)
         except Exception:  # whatever it was: a later look may be better, and jobs go on meanwhile
             log.exception("no tiles of others could be looked for; trying again in %.0f s", AFTER_FAILURE_S)
             self._not_before_s = time.monotonic() + AFTER_FAILURE_S

@@ -75,9 +75,9 @@ def run_worker(
     lifeline = Lifeline(settings.data_dir / "workers", lease.worker_id)
     lease.start()
     _start_thread("fence", _end_when_lost, lease)
-    _launch(engine, lease.worker_id, settings.worker_processes, context)
+    _launch(engine, settings.worker_processes, context)
     _start_thread("reaper", Reaper(url, lease, lifeline, client, context).run, stop)
-    _start_thread("helper", Helper(context, lease.worker_id).run, stop)
+    _start_thread("helper", Helper(context).run, stop)
     upkeep = Upkeep(client, context.sessions, blobs, settings.job_history_days, settings.track_history_days)
     _start_thread("upkeep", upkeep.run, stop)
     gc.collect()
@@ -105,8 +105,8 @@ def _start_thread(name: str, target: Callable[..., None], *arguments: object) ->
     threading.Thread(target=target, args=arguments, name=name, daemon=True).start()
 
 
-def _launch(engine: Engine, worker_id: str, fits_at_one_time: int, context: WorkflowContext) -> None:
-    job_engine = DBOS(config=engine_configuration(engine.url, worker_id))
+def _launch(engine: Engine, fits_at_one_time: int, context: WorkflowContext) -> None:
+    job_engine = DBOS(config=engine_configuration(engine.url, context.worker_id))
     DBOS.listen_queues([])  # our slots do
     DBOS.launch()
     # Where an operator's `resume` puts a job; nothing of ours waits there, and to look takes as long as for our queue.

@@ -165,9 +165,11 @@ def test_a_helper_that_fails_leaves_the_chunks_to_others(
     monkeypatch.setenv("ISODYN_TEST_DIARY", str(tmp_path / "diary"))
     board.offer(blob_store.put(json.dumps({"floor_id": "f", "fail_chunk": True}).encode()), 40)
     builder, blob_url = load_builder(DEFAULT_BUILDER), f"file://{tmp_path / 'blobs'}"
-    context = WorkflowContext(site.sessions, site.queue, blob_url, builder, "tests.jobs.fake_builder", Slots(2), "w")
+    context = WorkflowContext(
+        site.sessions, site.queue, blob_url, builder, "tests.jobs.fake_builder", Slots(2), "somebody"
+    )
     stop = threading.Event()
-    helping = threading.Thread(target=Helper(context, "somebody").run, args=(stop,))
+    helping = threading.Thread(target=Helper(context).run, args=(stop,))
     helping.start()
     deadline = time.monotonic() + 30.0
     while not (tmp_path / "diary").exists() and time.monotonic() < deadline:
